@@ -2,7 +2,8 @@
 
 The robots (bench/simulate/asked_robot.py) have changed since their calibration; both effects of a pair are fitted to a
 few seconds of speech. Then the robot is asked: by sounds of the probe's own choice until the odds are 20 to 1, by a sweep
-of 5 s, by 5 s of further sentences. All are recorded by the same robot and scored in the same way.
+of 5 s, by 5 s of further sentences. All are recorded by the same robot and give odds in the same way. The last row asks the
+probe as its command does: what the odds say must also hold, as a diagnosis judges it.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from bench.simulate.conversations import read_voices
 from bench.stale import DIAGNOSIS
 from edgefilter.calibration.calibrate import calibrate
 from edgefilter.calibration.sweep import generate_sweep
-from edgefilter.diagnosis.probe import ENOUGH, SOUND_S, Inquiry
+from edgefilter.diagnosis.probe import ENOUGH, SOUND_S, Inquiry, weights
 from edgefilter.errors import SignalError
 from edgefilter.types import Array
 
@@ -39,7 +40,7 @@ PAIRS = (
 STRENGTHS = ("near", "moderate")
 RECORDING_S = ASKED_S = 5.0
 """Of speech to begin with, so short that explanations remain; and of sound that may be asked for."""
-WAYS = ("the recording alone", "a sweep", "further sentences", "probe")
+WAYS = ("the recording alone", "a sweep", "further sentences", "probe, by its odds", "probe")
 TITLE = "What `probe` settles"
 
 
@@ -78,16 +79,16 @@ def examine(robot: AskedRobot, pair: tuple[str, str], strength: str) -> Row:
     sounds: tuple[str, ...] = ()
     for sound in (sweep, robot.further):
         try:
-            answer = inquiry.answer([inquiry.hear(robot.ask(sound, 1), sound)], [inquiry.gains(sound)])
-            found.append(outcome(answer.likely, true, answer.holds))
+            heard = inquiry.hear(robot.ask(sound, 1), sound)
+            found.append(outcome(weights(heard.evidence, [inquiry.gains(sound)]), true))
         except SignalError:
             found.append("open")
     try:
         answer = inquiry.ask(lambda sound: robot.ask(sound.samples, 2), ASKED_S)
-        found.append(outcome(answer.likely, true, answer.holds))
+        found += [outcome(answer.likely, true, holds) for holds in (True, answer.holds)]
         sounds = answer.sounds
     except SignalError:
-        found.append("open")
+        found += ["open", "open"]
     return Row(pair, robot.truth, strength, tuple(found), sounds)
 
 

@@ -49,15 +49,15 @@ def test_what_is_settled_needs_odds_of_twenty_to_one(likely: tuple[float, ...], 
 def test_robots_are_counted_by_way_by_pair_and_where_the_recording_does_not_settle_it() -> None:
     pair, right = probe.PAIRS[0], "right"
     rows = [
-        Row(pair, pair[0], "near", (right, right, right, right), ("noise",)),
-        Row(pair, pair[1], "near", ("open", "wrong", "open", right), ("noise", "odd lines")),
-        Row(probe.PAIRS[1], "codec", "near", ("wrong", "open", right, right), ("noise",)),
+        Row(pair, pair[0], "near", (right, right, right, right, right), ("noise",)),
+        Row(pair, pair[1], "near", ("open", "wrong", "open", "wrong", "open"), ("noise", "odd lines")),
+        Row(probe.PAIRS[1], "codec", "near", ("wrong", "open", right, right, right), ("noise",)),
     ]
     counts, pairs, sounds = probe.tables(rows)
     assert [row[0] for row in counts["rows"]] == list(probe.WAYS)
-    assert [row[1].split(" [")[0] for row in counts["rows"]] == ["1 of 3", "1 of 3", "2 of 3", "3 of 3"]
-    assert [row[2:4] for row in counts["rows"]] == [[1, 1], [1, 1], [1, 0], [0, 0]]
+    assert [row[1].split(" [")[0] for row in counts["rows"]] == ["1 of 3", "1 of 3", "2 of 3", "2 of 3", "2 of 3"]
+    assert [row[2:4] for row in counts["rows"]] == [[1, 1], [1, 1], [1, 0], [0, 1], [1, 0]]
     assert counts["rows"][0][4:] == [None] * 3
-    assert [row[4].split(" [")[0] for row in counts["rows"][1:]] == ["0 of 2", "1 of 2", "2 of 2"]
+    assert [row[4].split(" [")[0] for row in counts["rows"][1:]] == ["0 of 2", "1 of 2", "1 of 2", "1 of 2"]
     assert [row[0] for row in pairs["rows"]] == ["playback_gain or compression", "fan_noise or codec"]
     assert sounds["rows"] == [["noise", 3], ["odd lines", 1]]
