@@ -11,6 +11,7 @@ import soundfile
 from edgefilter.cli import main
 from edgefilter.diagnosis.passport import expected, measure
 from edgefilter.dsp.fractional_delay import interpolate
+from edgefilter.errors import SignalError
 from tests.diagnosis.robot_scene import DELAY, record, voice
 
 RATE = 16000
@@ -190,6 +191,7 @@ def test_the_diagnosis_is_in_the_passport_unless_it_is_left_out(passport, clean)
         (lambda mic, ref: (mic[:RATE // 2], ref), "0.50 s long"),
         (lambda mic, ref: (mic, 0 * ref), "the reference is silent"),
         (lambda mic, ref: (0 * mic, ref), "the recording is silent"),
+        (lambda mic, ref: (np.pad(mic, (60 * RATE, 0)), np.tile(ref, 6)), "the recording is silent in the first 60 s"),
     ],
 )  # fmt: skip
 def test_too_short_or_silent_is_one_line_and_exit_code_1(passport, clean, change, words):
@@ -197,6 +199,12 @@ def test_too_short_or_silent_is_one_line_and_exit_code_1(passport, clean, change
     code, _, err, _ = passport(*change(heard, said))
     lines = [line for line in err.splitlines() if line.startswith("edgefilter: ")]
     assert code == 1 and len(lines) == 1 and words in lines[0]
+
+
+def test_of_signals_too_the_first_minute_alone_is_looked_at(clean):
+    said, heard = clean
+    with pytest.raises(SignalError, match="the recording is silent in the first 60 s"):
+        measure(np.pad(heard, (60 * RATE, 0)), np.tile(said, 6), said, engines=[])
 
 
 @pytest.mark.parametrize(
