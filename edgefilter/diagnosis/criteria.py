@@ -75,7 +75,3 @@ class Criteria:
     """Over the silences: what the model of an effect that is really there does not leave."""
     nearly_all: float = 0.99
     """Share of the excess power with which what is left may be the imprecision of the model itself."""
-
-    # The fan
-    fan_change_db: float = 1.5
-    """By less than this a fan differs from day to day."""

@@ -12,7 +12,6 @@ from scipy import fft
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 from edgefilter.calibration.from_recording import TAIL_S
-from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.dsp.frames import all_block_power, blocks, decibels
@@ -21,7 +20,7 @@ from edgefilter.dsp.psd import floored, hann
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.lag_track import track_lag
-from edgefilter.echo.measurement import Measurement, whiten
+from edgefilter.echo.measurement import STEADY_DB, Measurement, whiten
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.recording import MAX_OFFSET, fitted_blocks, paired
 from edgefilter.errors import SignalError
@@ -277,11 +276,11 @@ def find_talk(square: Samples, active: NDArray[np.bool_]) -> tuple[tuple[float, 
 def fan_scale(quiet: Samples) -> float:
     """How much louder the fan is than in the calibration, in power, from the whitened recording's silences, (k,).
 
-    1 where the difference is no ordinary one (Criteria.fan_change_db), or where there is too little silence.
+    1 where the difference is no ordinary one (STEADY_DB), or where there is too little silence.
     """
     if quiet.size < SAMPLE_RATE // 2:
         return 1.0
     window = hann(256)
     spectrum = np.mean(power(fft.rfft(blocks(quiet, 256) * window)), axis=0) / np.sum(window**2)
     scale = float(np.median(spectrum[3:-6]))
-    return scale if abs(decibels(scale)) <= Criteria.fan_change_db else 1.0
+    return scale if abs(decibels(scale)) <= STEADY_DB else 1.0

@@ -16,7 +16,7 @@ from edgefilter.diagnosis.score import Scorer
 from edgefilter.echo.effect import vanishes
 from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.echo.evidence import Evidence, Score
-from edgefilter.echo.measurement import Values
+from edgefilter.echo.measurement import STEADY_DB, Values
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import UsageError
 
@@ -128,7 +128,7 @@ class Workbench:
         """
         score = self.score(model)
         told = score.active_db - float(np.clip(score.silent_db, -0.5, 0.5))
-        return max(told, abs(self.scorer.silent_db(score)) - self.criteria.fan_change_db)
+        return max(told, abs(self.scorer.silent_db(score)) - STEADY_DB)
 
     def explained(self, model: EchoModel) -> bool:
         """Whether a model leaves so little while the robot is heard that nothing further can be told in it."""

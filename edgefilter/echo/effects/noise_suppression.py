@@ -20,9 +20,7 @@ WINDOW = np.sqrt(hann(SIZE))
 FORGETTING, NEIGHBOURS = 0.5, 3
 """Of the local ratio, from frame to frame, and the bins over which it is averaged: what explains most of the suppressors tried."""
 KNOTS_DB = np.arange(-10.0, 31.0, 5.0)
-"""Local ratios of voice to fan; from the last one on everything is let through."""
-ALONE_DB = -20.0
-"""Ratio up to which the fan is alone."""
+"""Local ratios of voice to fan; from the last one on everything is let through, up to twice the first one the fan is alone."""
 LOUD_DB = 15.0
 """Where a suppressor lets nearly all through."""
 TRUST = 0.3
@@ -74,7 +72,7 @@ class NoiseSuppression(Effect):
         fan = variance_at(frequencies(SIZE // 2 + 1), np.resize(density, 601).astype(np.float32))
         spectra, own = (_spectra(np.pad(x, (HOP, SIZE))) for x in (noise, voice))
         gain_db = np.array([first(values, "softer_db"), *gain_db, 0.0])
-        spectra *= np.interp(decibels(_ratio(own, fan)), (ALONE_DB, *KNOTS_DB), 10.0 ** (gain_db / 20.0))
+        spectra *= np.interp(decibels(_ratio(own, fan)), (2.0 * KNOTS_DB[0], *KNOTS_DB), 10.0 ** (gain_db / 20.0))
         pieces = np.fft.irfft(spectra, SIZE) * WINDOW
         whole = np.zeros((pieces.shape[0] + 1, HOP))
         whole[:-1] += pieces[:, :HOP]
