@@ -103,7 +103,7 @@ def test_live_run_takes_the_monitor_ends_by_ctrl_c_and_equals_the_file_path(serv
 
 
 def test_live_the_loudspeaker_is_learned_by_another_process_and_remembered(server, tmp_path):
-    scene = Scene(seconds=9.0)
+    scene = Scene(seconds=16.0)
     for sink, sound in (("robot", scene.reference), ("robot_mic", scene.mic)):
         soundfile.write(tmp_path / f"{sink}.wav", sound, 16_000, "PCM_16")
     file = tmp_path / "robot.npz"
