@@ -70,7 +70,8 @@ class NoiseSuppression(Effect):
             return noise.copy()
         density = 10.0 ** (numbers(values, "fan_db") / 10.0)
         fan = variance_at(frequencies(SIZE // 2 + 1), np.resize(density, 601).astype(np.float32))
-        spectra, own = (_spectra(np.pad(x, (HOP, SIZE))) for x in (noise, voice))
+        spectra = _spectra(np.pad(noise, (HOP, SIZE)))
+        own = spectra if voice is noise else _spectra(np.pad(voice, (HOP, SIZE)))
         gain_db = np.array([first(values, "softer_db"), *gain_db, 0.0])
         spectra *= np.interp(decibels(_ratio(own, fan)), (2.0 * KNOTS_DB[0], *KNOTS_DB), 10.0 ** (gain_db / 20.0))
         pieces = np.fft.irfft(spectra, SIZE) * WINDOW
