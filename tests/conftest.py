@@ -1,4 +1,4 @@
-"""Which tests share a process where several run at once (pytest -n 3), and which begin; a catalogue that can be added to."""
+"""Which tests share a process where several run at once (pytest -n 3), and which begin; a catalogue that any test can add to."""
 
 import os
 from pathlib import Path
@@ -62,9 +62,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: LONGEST.index(groups[item]) if groups[item] in LONGEST else len(LONGEST))
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def own_catalogue(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a test registers is forgotten when it is over."""
+    """What a test registers or loads is forgotten when it is over: the effect and the file that it came from."""
+    from edgefilter.echo import user_effects
     from edgefilter.echo.effects import catalogue
 
     monkeypatch.setattr(catalogue, "_known", dict(catalogue._known))
+    monkeypatch.setattr(user_effects, "_loaded", dict(user_effects._loaded))

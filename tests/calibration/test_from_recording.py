@@ -68,7 +68,7 @@ def test_without_a_robot_it_is_one_line(said):
         self_calibrate(0.1 * record(said) + voice(10.0, seed=5), said)
 
 
-def test_a_filter_of_the_users_own_is_not_in_a_profile_that_others_may_load(said, own_catalogue):
+def test_a_filter_of_the_users_own_is_not_in_a_profile_that_others_may_load(said):
     class Own(Effect):
         name, stage, family = "my_filter", "path", "linear path"
         parameters = (Parameter("amount", "1", 0.0, 0.0, 2.0),)

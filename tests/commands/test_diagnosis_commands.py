@@ -11,7 +11,7 @@ import soundfile
 from edgefilter.cli import main
 from edgefilter.profile.data import Profile
 from tests.diagnosis.robot_scene import profile, record, voice
-from tests.echo.test_user_effects import documented_file, own_registry  # noqa: F401
+from tests.echo.test_user_effects import documented_file
 
 RATE = 16000
 
@@ -125,7 +125,7 @@ def test_diagnose_finds_what_is_missing_and_writes_the_documented_json(scene, ca
 
 
 @pytest.mark.slow
-def test_what_no_effect_explains_is_written_as_one_of_my_own_which_add_takes(scene, tmp_path, capsys, own_registry):  # noqa: F811
+def test_what_no_effect_explains_is_written_as_one_of_my_own_which_add_takes(scene, tmp_path, capsys):
     x, mine, page = voice(6.0), tmp_path / "my_tremolo.py", tmp_path / "r.html"
     shaken = x * (1.0 + 0.5 * np.sin(2 * np.pi * 5.0 * np.arange(x.size) / RATE))
     for name, samples in (("said", x), ("shaken", record(shaken.astype(np.float32)))):
@@ -250,7 +250,7 @@ def test_wrong_usage_is_one_line_and_exit_2(scene, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_an_effect_of_ones_own_goes_through_every_command(tmp_path, capsys, own_registry):  # noqa: F811
+def test_an_effect_of_ones_own_goes_through_every_command(tmp_path, capsys):
     x, robot = voice(8.0), profile()
     own = ["--effects", documented_file(tmp_path)]
     robot.save(tmp_path / "robot.npz")

@@ -115,7 +115,7 @@ class Fragile(Effect):
 
 
 @pytest.fixture
-def fragile(monkeypatch, own_catalogue) -> Fragile:
+def fragile(monkeypatch) -> Fragile:
     effect = Fragile()
     monkeypatch.setattr(Fragile, "failures", [])
     register(effect)

@@ -32,7 +32,7 @@ def test_where_nothing_was_over_the_fan_nothing_is_explained():
 @pytest.mark.parametrize(
     "error", [np.linalg.LinAlgError("singular matrix"), FloatingPointError("overflow"), ZeroDivisionError("by zero")]
 )
-def test_an_explanation_that_cannot_be_fitted_is_one_line_that_names_it(own_catalogue, error):
+def test_an_explanation_that_cannot_be_fitted_is_one_line_that_names_it(error):
     class Unfit(PlaybackGain):
         name = "unfit"
 

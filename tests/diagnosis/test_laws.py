@@ -62,8 +62,8 @@ def numbers(law: Law) -> list[float]:
 
 
 @pytest.fixture
-def load(tmp_path: Path, own_catalogue) -> Callable[[Law, str], str]:
-    """Write a law and load it, in a catalogue that is as before when the test is over."""
+def load(tmp_path: Path) -> Callable[[Law, str], str]:
+    """Write a law and load it."""
 
     def loaded(law: Law, name: str) -> str:
         path = tmp_path / f"{name}.py"

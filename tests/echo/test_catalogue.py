@@ -108,7 +108,7 @@ def test_the_order_in_which_effects_were_found_changes_no_prediction() -> None:
     assert all(np.array_equal(found, predictions[0]) for found in predictions)
 
 
-def test_a_users_effect_comes_after_those_of_its_stage(own_catalogue) -> None:
+def test_a_users_effect_comes_after_those_of_its_stage() -> None:
     class Late(Effect):
         name, stage, parameters = "aaa", "source", ()
 

@@ -10,7 +10,6 @@ import pytest
 
 from edgefilter import enhance
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.echo import user_effects
 from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.running import SourceChain, VoiceChain, reach, stream_form
@@ -34,11 +33,6 @@ class Tilt:
     def fit(self, measurement, model):
         return {"amount": 0.5}
 """
-
-
-@pytest.fixture(autouse=True)
-def own_registry(monkeypatch, own_catalogue):
-    monkeypatch.setattr(user_effects, "_loaded", {})
 
 
 @pytest.fixture
