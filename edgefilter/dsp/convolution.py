@@ -1,4 +1,4 @@
-"""The convolution of a recording with a filter, in blocks that are transformed together."""
+"""The convolution of a recording with a filter, in blocks of which some are transformed together."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ from scipy import fft
 
 from edgefilter.dsp.frames import frames
 from edgefilter.types import Array
+
+TOGETHER = 8
+"""Blocks or frames that are transformed at once, so that memory stays bounded."""
 
 
 def convolve(x: Array, taps: Array) -> Array:
@@ -22,6 +25,8 @@ def convolve(x: Array, taps: Array) -> Array:
         return fft.irfft(fft.rfft(x, size) * fft.rfft(taps, size), size)[:whole]
     new = size - before
     count = -(-whole // new)
-    padded = np.pad(x, (before, count * new - x.size))
-    filtered = fft.rfft(frames(padded, size, new)) * fft.rfft(taps, size)
-    return fft.irfft(filtered, size)[:, before:].ravel()[:whole]
+    read, response = frames(np.pad(x, (before, count * new - x.size)), size, new), fft.rfft(taps, size)
+    out = np.empty((count, new), np.result_type(x, taps))
+    for at in range(0, count, TOGETHER):
+        out[at : at + TOGETHER] = fft.irfft(fft.rfft(read[at : at + TOGETHER]) * response, size)[:, before:]
+    return out.ravel()[:whole]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import fft
 
+from edgefilter.dsp.convolution import TOGETHER
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.frames import frames
 from edgefilter.types import SAMPLE_RATE, Array, Samples
@@ -25,8 +26,11 @@ def hann(size: int) -> Array:
 
 def periodograms(x: Samples, size: int) -> Array:
     """PSD of each half-overlapping Hann frame of x (n,), (f, size / 2 + 1): their mean is Welch's estimate (1967)."""
-    window = hann(size)
-    found = power(fft.rfft(frames(x, size, size // 2) * window, axis=1)) / (SAMPLE_RATE * np.sum(window**2))
+    window, read = hann(size), frames(x, size, size // 2)
+    found = np.empty((read.shape[0], size // 2 + 1))
+    for at in range(0, read.shape[0], TOGETHER):
+        found[at : at + TOGETHER] = power(fft.rfft(read[at : at + TOGETHER] * window, axis=1))
+    found /= SAMPLE_RATE * np.sum(window**2)
     found[:, 1:-1] *= 2.0
     return found
 

@@ -48,13 +48,10 @@ class HopHistory:
         for hop, _ in self._hops:
             path.step(hop.mic, hop.reference, hop.located, hop.past)
 
-    def signals(self) -> tuple[Samples, Samples, Samples]:
-        """Microphone, reference and innovation, (n,) each; of an array the first microphone."""
-        mic, reference, innovation = (
-            np.concatenate([row if row.ndim == 1 else row[0] for row in rows])
-            for rows in zip(*(hop[:3] for hop, _ in self._hops), strict=True)
-        )
-        return mic, reference, innovation
+    def signal(self, name: str) -> Samples:
+        """Microphone, reference or innovation, by its name in FilteredHop, (n,); of an array the first microphone."""
+        rows = (getattr(hop, name) for hop, _ in self._hops)
+        return np.concatenate([row if row.ndim == 1 else row[0] for row in rows])
 
     def noise(self) -> Samples:
         """Recording of an array where nothing of the robot can be audible, everything where that is under a second, (microphones, n)."""

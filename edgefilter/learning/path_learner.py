@@ -214,12 +214,11 @@ class PathLearner:
     def _fitted(self) -> Effects:
         """The effects of the beginning, those that can be learned as they explain the newest seconds."""
         recent, effects = self._history.recent(), self._begin.effects
-        mic, reference, innovation = recent.signals()
         use = recent.usable()
         if use.sum() < FIRST_S * SAMPLE_RATE / 2:
             return effects
-        noise_psd = floored(periodograms(innovation[use], GRID_FFT).mean(axis=0)).astype(np.float32)
-        measurement = Measurement(reference, mic, noise_psd, use)
+        noise_psd = floored(periodograms(recent.signal("innovation")[use], GRID_FFT).mean(axis=0)).astype(np.float32)
+        measurement = Measurement(recent.signal("reference"), recent.signal("mic"), noise_psd, use)
         path = first(self._running.canceller.impulse_response())
         for effect in EFFECTS:
             if effect.learned:
@@ -265,8 +264,7 @@ def learned_profile(base: Profile | None, path: EchoPath, history: HopHistory) -
     """The profile of a robot heard through that path, with the noise of its silences; base: keeps what a calibration alone measures."""
     canceller = path.canceller
     response = canceller.impulse_response()
-    mic, reference, _ = history.signals()
-    noise_psd = floored(fan_in_silences(mic, history.silent())[0]).astype(np.float32)
+    noise_psd = floored(fan_in_silences(history.signal("mic"), history.silent())[0]).astype(np.float32)
     today = datetime.datetime.now(datetime.timezone.utc).date().isoformat()
     if base is not None:
         adapted = base.with_running_responses(response, canceller.volume.gain, path.effects)
@@ -276,7 +274,7 @@ def learned_profile(base: Profile | None, path: EchoPath, history: HopHistory) -
         array = ArrayCalibration(response[1:], cross_density(history.noise()))
         response = response[0]
     echo = EchoModel(response, path.effects)
-    bands, snr = bands_over_fan(whiten(echo.predict(reference), noise_psd))
+    bands, snr = bands_over_fan(whiten(echo.predict(history.signal("reference")), noise_psd))
     return Profile(
         echo=echo,
         delay=history.delay,

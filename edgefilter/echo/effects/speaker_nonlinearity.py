@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 
@@ -74,9 +74,10 @@ class SpeakerNonlinearity(Effect):
         driving = np.concatenate([_pair(values, name) for name in DRIVER])
         bending = np.stack([_pair(values, name) for name in AMPLIFIER], axis=1).ravel()
         if driving.any():
-            out += driving @ driver_terms(x, first(values, "resonance_hz"), first(values, "excursion"), sample_rate)
+            terms = driver_terms(x, first(values, "resonance_hz"), first(values, "excursion"), sample_rate)
+            out += driving @ np.stack([*terms])
         if bending.any():
-            out += bending @ amplifier_terms(x, first(values, "knee"))
+            out += bending @ np.stack([*amplifier_terms(x, first(values, "knee"))])
         gain_db = first(values, "gain_db")
         return out * np.float32(10.0 ** (gain_db / 20.0)) if gain_db else out
 
@@ -111,8 +112,10 @@ def _pair(values: Values, name: str) -> Array:
     return pair
 
 
-def driver_terms(x: Samples, resonance_hz: float, excursion: float, sample_rate: int = SAMPLE_RATE) -> Samples:
-    """The terms s x, s^2 x, -s d, -s^2 d, -s d'/w, -s^2 d'/w for the drive x (n,), (6, n) float32.
+def driver_terms(
+    x: Samples, resonance_hz: float, excursion: float, sample_rate: int = SAMPLE_RATE
+) -> Iterator[Samples]:
+    """The terms s x, s^2 x, -s d, -s^2 d, -s d'/w, -s^2 d'/w for the drive x (n,), (n,) float32 each.
 
     The equation of motion d'' + (w/Q) d' + w^2 d = w^2 x keeps its left side when force factor, stiffness and damping
     depend on the displacement d; what they change is a drive of its own on the right side (Klippel 2006, "Loudspeaker
@@ -121,21 +124,18 @@ def driver_terms(x: Samples, resonance_hz: float, excursion: float, sample_rate:
     """
     moved = motion(x, resonance_hz, sample_rate)
     s = _bent(moved[0], excursion)
-    driven = np.stack((x, -moved[0], -moved[1]))
-    terms = np.empty((len(DRIVER), 2, x.size), np.float32)
-    np.multiply(driven, s, out=terms[:, 0])
-    np.multiply(terms[:, 0], s, out=terms[:, 1])
-    return terms.reshape(2 * len(DRIVER), x.size)
+    for driven in (x, -moved[0], -moved[1]):
+        term = driven * s
+        yield term
+        yield term * s
 
 
-def amplifier_terms(x: Samples, knee: float) -> Samples:
-    """The terms s x, s^2 x, s^3 x, s^4 x with s = u / sqrt(1 + u^2), u = x / knee, (4, n) float32."""
+def amplifier_terms(x: Samples, knee: float) -> Iterator[Samples]:
+    """The terms s x, s^2 x, s^3 x, s^4 x with s = u / sqrt(1 + u^2), u = x / knee, (n,) float32 each."""
     s = _bent(x, knee)
-    terms = np.empty((2 * len(AMPLIFIER), x.size), np.float32)
-    np.multiply(x, s, out=terms[0])
-    for before, term in zip(terms, terms[1:], strict=False):
-        np.multiply(before, s, out=term)
-    return terms
+    for _ in range(2 * len(AMPLIFIER)):
+        x = x * s
+        yield x
 
 
 def _bent(x: Samples, scale: float) -> Samples:
@@ -183,14 +183,16 @@ def fit_laws(
         bend, move = part.amplifier(), part.driver()
         if not (part.promising(bend) or part.promising(move)):
             return None
-        bend, move = (search.part(found.setting, found.scale) for found in (bend, move))
+        chosen = [(found.setting, found.scale) for found in (bend, move)]
+        del part, bend, move  # their columns are as large as those of all samples, which come next
+        bend, move = (search.part(*each) for each in chosen)
     parts = [min(move, bend, key=_by_left)]
-    left, together = parts[0].left, search.halves.left(np.concatenate((move.columns, bend.columns), axis=1))
+    left, together = parts[0].left, search.halves.left(move.columns, bend.columns)
     if together < (1.0 - FURTHER) * left:
         parts, left = [move, bend], together
     if left > (1.0 - LEAST) * search.base:
         return None
-    found, level_db, gain_db = search.halves.whole(np.concatenate([part.columns for part in parts], axis=1))
+    found, level_db, gain_db = search.halves.whole(*(part.columns for part in parts))
     driving = found[: 2 * len(DRIVER)] if move in parts else np.zeros(2 * len(DRIVER))
     bending = found[-2 * len(AMPLIFIER) :] if bend in parts else np.zeros(2 * len(AMPLIFIER))
     return {
@@ -213,7 +215,7 @@ class _Search:
 
     def __init__(self, x: Samples, hear: Callable[[Samples], Samples], halves: _Halves) -> None:
         self._x, self._hear, self.halves = x, hear, halves
-        self.base, self._peak = halves.left(np.zeros((halves.used.size, 0), np.float32)), _peak(x[halves.used])
+        self.base, self._peak = halves.left(), _peak(x[halves.used])
         self.silent = self.base <= 0.0 or self._peak <= 0.0
 
     def amplifier(self) -> _Part:
@@ -245,7 +247,7 @@ class _Search:
     def part(self, setting: float, scale: float) -> _Part:
         """Driver of that resonance and excursion, or amplifier (setting 0) of that knee."""
         terms = driver_terms(self._x, setting, scale) if setting else amplifier_terms(self._x, scale)
-        columns = self.halves.columns(map(self._hear, terms), len(terms))
+        columns = self.halves.columns(map(self._hear, terms), 2 * len(DRIVER if setting else AMPLIFIER))
         return _Part(setting, scale, columns, self.halves.left(columns))
 
 
@@ -275,19 +277,21 @@ class _Halves:
             np.multiply(signal[self.used], self._root[:, 0], out=column)
         return out
 
-    def left(self, columns: Samples) -> float:
-        """What the linear voice and columns (used, k), fitted to one half, leave on the other: the sum of both ways."""
+    def left(self, *columns: Samples) -> float:
+        """What the linear voice and columns, (used, k) each, fitted to one half, leave on the other: the sum of both ways."""
         first, second = self._normal(columns)
         return _left(first, _solved(second)) + _left(second, _solved(first))
 
-    def whole(self, columns: Samples) -> tuple[Array, float, float]:
-        """Weights of columns (used, k) re the linear voice's gain, (k,), fitted to all; the level of what they add, and that gain, dB."""
+    def whole(self, *columns: Samples) -> tuple[Array, float, float]:
+        """Weights of columns, (used, k) each, re the linear voice's gain, fitted to all; the level of what they add, and that gain, dB."""
         first, second = self._normal(columns)
         found = _solved(first + second)
         voice, filtered = self._voice(np.eye(NUISANCE_TAPS)[NUISANCE_LEAD]), self._voice(found[:NUISANCE_TAPS])
         gain = level_ratio(filtered, voice) or 1.0
         weights = found[NUISANCE_TAPS:] / gain
-        added = columns @ weights.astype(np.float32)
+        ends = np.cumsum([each.shape[1] for each in columns[:-1]], dtype=int)
+        shares = np.split(weights.astype(np.float32), ends)
+        added: Samples = np.sum([each @ share for each, share in zip(columns, shares, strict=True)], axis=0)
         added -= level_ratio(added, voice) * voice
         level = float(np.dot(added, added)) / (float(np.dot(voice, voice)) + 1e-30)
         return weights, 10.0 * float(np.log10(level + 1e-12)), 20.0 * float(np.log10(max(abs(gain), 1e-3)))
@@ -296,16 +300,16 @@ class _Halves:
         """The linear voice through taps (NUISANCE_TAPS,), weighted, (used,)."""
         return (self._linear @ taps.astype(np.float32))[self.used] * self._root[:, 0]
 
-    def _normal(self, columns: Samples) -> list[Array]:
+    def _normal(self, columns: Sequence[Samples]) -> list[Array]:
         """Of each half the weighted products of linear voice, columns and target with each other."""
-        size = NUISANCE_TAPS + columns.shape[1] + 1
+        size = NUISANCE_TAPS + sum(each.shape[1] for each in columns) + 1
         halves = [np.zeros((size, size)), np.zeros((size, size))]
         edges = (0, self._split, self.used.size)
         for total, start, stop in zip(halves, edges[:-1], edges[1:], strict=True):
             for at in range(start, stop, CHUNK):
                 piece = slice(at, min(at + CHUNK, stop))
                 linear = self._linear[self.used[piece]] * self._root[piece]
-                rows = np.concatenate((linear, columns[piece], self._target[piece]), axis=1)
+                rows = np.concatenate((linear, *(each[piece] for each in columns), self._target[piece]), axis=1)
                 total += rows.T @ rows
         return halves
 
