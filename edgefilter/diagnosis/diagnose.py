@@ -310,6 +310,6 @@ def _without_doubtful(found: Found) -> Found:
 
 def explained_level(found: Found) -> float:
     """Part of the level over the robot's silences that is gone, 0 to 1: of many cells rather than of the loudest."""
-    above = found.base.over_db - Scorer(found.prepared).floor_level(found.final)
+    above = found.base.over_db - found.final.floor_db
     gone = found.base.over_db - found.final.over_db
     return float(np.clip(gone / above, 0.0, 1.0)) if above > 0.0 else 0.0

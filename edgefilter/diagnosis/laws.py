@@ -209,7 +209,7 @@ def free_law(found: Found, criteria: Criteria, progress: Callable[[str], None] |
     tried = [each for model, names in starts for each in _laws(scorer, model, names, progress)]
     law, score = max(tried, key=lambda each: -each[1].level_db, default=(None, base))
     most_db = base.level_db - score.level_db
-    little = most_db < criteria.part_level * (base.over_db - scorer.floor_level(base))
+    little = most_db < criteria.part_level * (base.over_db - base.floor_db)
     if law is None or little or share_of(base.excess_db, score.excess_db) < criteria.half:
         return None
     return law if base.level_db - found.final.level_db < criteria.nearly * most_db else None

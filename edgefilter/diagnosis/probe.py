@@ -19,8 +19,10 @@ from edgefilter.diagnosis.score import STEP, Scorer
 from edgefilter.diagnosis.trials import Found
 from edgefilter.dsp.convolution import convolve
 from edgefilter.dsp.fractional_delay import delayed
+from edgefilter.dsp.frames import decibels
 from edgefilter.dsp.psd import GRID_BINS, coloured, frequencies
 from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.evidence import Score
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import SignalError, UsageError
@@ -79,8 +81,8 @@ class Sound:
 class Answer:
     """Explanations and their probabilities after those sounds, likely: (explanations + 1,), the last of none of them.
 
-    holds: whether the first is what happened, and all that did, as a diagnosis judges it, in the recording and in what was
-    heard of each sound. left_db: excess that it leaves in the worst of them; in_answer: whether that is a sound's.
+    holds: whether the first is what happened, and all that did, as a diagnosis judges it, of the recording and what was
+    heard of the sounds as one. left_db: excess that it leaves in the worst of them; in_answer: whether that is a sound's.
     """
 
     explanations: tuple[Explanation, ...]
@@ -257,7 +259,8 @@ class Inquiry:
         """Which is nearer to what was heard of those sounds, with what was expected of them (gains), and whether it holds.
 
         That is judged on what no fit has seen: for one half of the first recording it is fitted to the other half and to
-        all that was heard, since a few seconds of speech do not teach a long filter.
+        all that was heard, since a few seconds of speech do not teach a long filter. And it is judged of all as of one
+        recording, since a law that loud words have taught errs in the softest sound.
         """
         nothing = np.zeros((0, len(self.explanations) + 1))
         likely = weights(np.concatenate([nothing, *(one.evidence for one in heard)]), gains)
@@ -266,12 +269,9 @@ class Inquiry:
         first = self._again(self.explanations[best], self._first.model, self._first, *new)
         judged = [(self._first, first), *((part, them[best]) for each in heard for part, them in each.halves)]
         found = [_found(part, one.model) for part, one in judged]
-        criteria = Criteria()
-        worst = max(found, key=lambda one: (not holds(one, criteria), one.final.excess_db))
-        left_db = worst.final.excess_db
-        return Answer(
-            self.explanations, likely, sounds, holds(worst, criteria), left_db, in_answer=worst is not found[0]
-        )
+        left = [one.final.excess_db for one in found]
+        worst = int(np.argmax(left))
+        return Answer(self.explanations, likely, sounds, holds(_as_one(found), Criteria()), left[worst], worst > 0)
 
 
 def weights(found: Array, gains: Sequence[Array] = ()) -> Array:
@@ -396,6 +396,31 @@ def _found(prepared: Prepared, model: EchoModel) -> Found:
     """What a model leaves of a recording, as a search says it that ends with that model."""
     scorer, start = Scorer(prepared), prepared.model
     return Found(prepared, start, model, scorer.of(start), scorer.of(model), ())
+
+
+def _as_one(found: Sequence[Found]) -> Found:
+    """What a model leaves of several recordings, scored as one of that length: levels in the mean, excess in mean power."""
+    seconds = [np.count_nonzero(each.prepared.held_out) for each in found]
+
+    def joined(scores: Sequence[Score]) -> Score:
+        def level(name: str) -> float:
+            return float(np.average([getattr(one, name) for one in scores], weights=seconds))
+
+        def power(name: str) -> float:
+            return float(decibels(np.average([10 ** (getattr(one, name) / 10) for one in scores], weights=seconds)))
+
+        return replace(
+            scores[0],
+            level_db=level("level_db"),
+            over_db=level("over_db"),
+            floor_db=level("floor_db"),
+            excess_db=power("excess_db"),
+            active_db=power("active_db"),
+            silent_db=power("silent_db"),
+            fitted_db=power("fitted_db"),
+        )
+
+    return replace(found[0], base=joined([one.base for one in found]), final=joined([one.final for one in found]))
 
 
 def _cells(scorer: Scorer, model: EchoModel) -> tuple[Array, Array, Array]:

@@ -139,13 +139,15 @@ class Scorer:
         if passed is not self._fan:
             variance = variance * (self.cells(passed + self._rounding) / self._fan_cells)
         cells = self.cells(residual) / variance
-        over_db = self._mean(decibels(0.5 + 0.5 * cells))
+        levels = decibels(0.5 + 0.5 * cells)
+        over_db = self._mean(levels)
         louder = self._by_band(self._expected / known._expected)
         cost_db = self._mean(0.5 * decibels(variance * louder / known._ordinary_cells))
         held, active = self.prepared.held_out, self.prepared.active
         return Score(
             level_db=over_db + cost_db,
             over_db=over_db,
+            floor_db=self._mean(levels[self.silent_cells]),
             excess_db=_db(power[held]),
             active_db=_db(power[held & active]),
             silent_db=_db(power[held & ~active]),
@@ -154,10 +156,6 @@ class Scorer:
             cells=cells,
             prediction=corrected,
         )
-
-    def floor_level(self, score: Score) -> float:
-        """Score.over_db of the cells in which the robot is silent, 0 where it never is: what is left at best."""
-        return self._mean(decibels(0.5 + 0.5 * score.cells[self.silent_cells]))
 
     def silent_db(self, score: Score) -> float:
         """By how much the robot's silences, or all where it is never silent, are louder than expected, dB."""

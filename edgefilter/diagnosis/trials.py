@@ -142,7 +142,7 @@ class Workbench:
     def left(self, model: EchoModel) -> float:
         """Level in dB over that of the silences."""
         score = self.score(model)
-        return max(score.over_db - self.scorer.floor_level(score), 0.0)
+        return max(score.over_db - score.floor_db, 0.0)
 
     def attempt(self, name: str, model: EchoModel) -> Trial | None:
         """The effect of that name fitted beside what the model has.

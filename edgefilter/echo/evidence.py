@@ -22,7 +22,8 @@ class Score:
     Student's t of as many degrees as a cell has (Lange, Little & Taylor 1989, "Robust statistical modeling using the t
     distribution"), around the noise that the model expects. Far over that it is the mean of the cells' dB: many cells
     count, not the loudest. Noise that a model expects on top of the ordinary costs half of its dB: else anything could
-    be called noise. over_db: the same without that cost.
+    be called noise. over_db: the same without that cost. floor_db: that of the cells in which the robot is silent, 0 where it
+    never is: what is left at best.
     excess_db: mean power of the held-out whitened residual, dB. active_db, silent_db: while the robot is heard, and is
     not. fitted_db: of the samples to fit on, while it is heard. Noise that a model expects counts as fan in these;
     irreducible_db: the excess over the fan alone then, else 0.
@@ -31,6 +32,7 @@ class Score:
 
     level_db: float
     over_db: float
+    floor_db: float
     excess_db: float
     active_db: float
     silent_db: float

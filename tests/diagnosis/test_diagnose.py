@@ -227,7 +227,16 @@ def test_what_ordinary_recordings_show_more_of_than_is_left_is_not_fitted():
 
 def verdict(active_db: float, fitted_db: float) -> Score:
     return Score(
-        active_db, active_db, active_db, active_db, 0.0, fitted_db, 0.0, np.ones((4, 4)), np.zeros(16000, np.float32)
+        active_db,
+        active_db,
+        0.0,
+        active_db,
+        active_db,
+        0.0,
+        fitted_db,
+        0.0,
+        np.ones((4, 4)),
+        np.zeros(16000, np.float32),
     )
 
 

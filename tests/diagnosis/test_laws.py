@@ -156,7 +156,7 @@ def test_what_is_of_one_recording_is_written_as_an_event_of_it(family: str, even
 def test_a_law_is_told_where_it_explains_enough_of_the_level_and_of_the_power(least: str, factor: float) -> None:
     found, law = searched("modulation", 3.0), lawful("modulation", 3.0)
     explained = {
-        "part_level": law.gain_db / (found.base.over_db - Scorer(found.prepared).floor_level(found.base)),
+        "part_level": law.gain_db / (found.base.over_db - found.base.floor_db),
         "half": share_of(found.base.excess_db, law.excess_db),
     }[least]
     told = free_law(found, replace(Criteria(), **{least: factor * explained}))
