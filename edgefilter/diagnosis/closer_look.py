@@ -67,7 +67,7 @@ class CloserLook:
 
 def look_closer(found: Found) -> CloserLook:
     """What the final residual of a search looks like beside the prediction."""
-    prepared = found.heard
+    prepared = found.in_noise
     predicted = prepared.measurement.whiten(found.final.prediction)
     voice = predicted * prepared.usable
     left = (prepared.measurement.white_recording - predicted) * prepared.usable

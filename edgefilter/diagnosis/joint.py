@@ -26,7 +26,7 @@ def fit_jointly(measurement: Measurement, model: EchoModel, wanted: Sequence[str
     for _ in range(Criteria.rounds if len(wanted) > 1 else 1):
         for name in wanted:
             model = model.fit(name, measurement)
-        error = measurement.error(measurement.heard(model)[0])
+        error = measurement.error(measurement.predicted(model)[0])
         if error < least:
             best, before, least = model, least, error
             if error < (1.0 - WORTH) * before:

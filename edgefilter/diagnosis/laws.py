@@ -240,7 +240,7 @@ class _Ground:
     def __init__(self, scorer: Scorer, model: EchoModel, stage: Literal["source", "path"]) -> None:
         self.stage = stage
         self._measurement, self._model = scorer.measurement, model
-        plain, self.heard = self._measurement.heard(model)
+        plain, self.heard = self._measurement.predicted(model)
         self.x = self._measurement.reference if stage == "source" else plain
         self.target, self.weights = self._measurement.white_recording, self._measurement.weights
         self.lag = PRE_ROLL if stage == "source" else 0

@@ -34,7 +34,7 @@ class Leftover:
 
 def leftover(found: Found) -> Leftover:
     """Look at what the model that was found leaves; a gain of the microphone, which the fan passed as well, is taken out."""
-    prepared, heard = found.heard, found.heard.measurement.recording
+    prepared, heard = found.in_noise, found.in_noise.measurement.recording
     residual, psd = (heard - found.final.prediction) / found.model.microphone_gain(heard.size), prepared.noise_psd
     strongest = tones(residual, psd)
     quiet = blocks(prepared.usable & ~prepared.active, BLOCK).all(axis=1)

@@ -75,13 +75,13 @@ def _derivative(found: Found, finding: Finding, parameter: Parameter, index: int
     step = max(STEP * (_half_width(finding, parameter, index) or 0.0), LEAST_STEP * abs(at), 1e-9)
     step = step if at + step <= parameter.high else -step
     value.flat[index] = at + step
-    measurement = found.heard.measurement
+    measurement = found.in_noise.measurement
     values = {**finding.values, parameter.name: value if value.ndim else float(value)}
     try:
         changed = found.model.with_effect(finding.effect, values).predict(measurement.reference)
     except (UsageError, ArithmeticError):
         return None
-    change = measurement.whiten(changed - measurement.heard(found.model)[0]) * measurement.weights
+    change = measurement.whiten(changed - measurement.predicted(found.model)[0]) * measurement.weights
     if float(np.mean(np.square(change, dtype=np.float64))) < SMALL * (step / max(abs(at), abs(step))) ** 2:
         return None
     return np.asarray(change / step, np.float64)
@@ -89,8 +89,8 @@ def _derivative(found: Found, finding: Finding, parameter: Parameter, index: int
 
 def _covariance(found: Found, derivatives: Array) -> Array | None:
     """Covariance of numbers with those derivatives (k, n), (k, k); None where they cannot be told apart at all."""
-    measurement = found.heard.measurement
-    residual = (measurement.white_recording - measurement.heard(found.model)[1]) * measurement.weights
+    measurement = found.in_noise.measurement
+    residual = (measurement.white_recording - measurement.predicted(found.model)[1]) * measurement.weights
     scale = np.sqrt(np.sum(derivatives**2, axis=1))
     unit = derivatives / scale[:, None]
     curvature = unit @ unit.T

@@ -163,7 +163,7 @@ class Inquiry:
             model = _fitted(measurement, self._first.model, effects)
             power, expected, voice = _cells(scorer, model)
             over = np.maximum(np.sum(power - expected, axis=0), 0.0) / np.maximum(np.sum(voice, axis=0), 1e-12)
-            heard = measurement.heard(model)[1]
+            heard = measurement.predicted(model)[1]
             noisy = model.unpredictable(measurement.reference) or any(find(name).stage == "noise" for name in effects)
             if noisy or all(np.sum((heard - other) ** 2) > TWINS * np.sum(other**2) for other in voices):
                 error = np.interp(frequencies(GRID_BINS), scorer.band_hz.mean(axis=1), over)

@@ -111,7 +111,9 @@ class Scorer:
         """
         here, reference = self.behind(model), self.measurement.reference
         heard = (
-            here.measurement.heard(model) if prediction is None else (prediction, here.measurement.whiten(prediction))
+            here.measurement.predicted(model)
+            if prediction is None
+            else (prediction, here.measurement.whiten(prediction))
         )
         passed, gain = model.passed(here._fan, reference), model.microphone_gain(self.usable.size)
         return here._score(*heard, model.unpredictable(reference), passed, gain, self)

@@ -61,7 +61,7 @@ def _runs(bench: Workbench, start: EchoModel) -> Iterator[EchoModel]:
 def _starts(bench: Workbench, start: EchoModel) -> Iterator[Trial]:
     """The trial to begin with, then others that explain a good part of something else, named or not: what hides them may be found beside them."""
     criteria = bench.criteria
-    if bench.heard(start) <= criteria.silent_db:
+    if bench.off_db(start) <= criteria.silent_db:
         return
     trials = bench.attempt_all(start)
     first = bench.preferred(t for t in trials if bench.admissible(t, start))

@@ -78,7 +78,7 @@ class Found:
     tried: tuple[Tried, ...] = ()
 
     @cached_property
-    def heard(self) -> Prepared:
+    def in_noise(self) -> Prepared:
         """The recording prepared with the fan that was found."""
         return self.prepared.behind(self.model)
 
@@ -120,7 +120,7 @@ class Workbench:
             self._scores[key] = self.scorer.of(model)
         return self._scores[key]
 
-    def heard(self, model: EchoModel) -> float:
+    def off_db(self, model: EchoModel) -> float:
         """How far what a model leaves is from the noise that it expects, dB.
 
         While the robot is heard, over its silences, of half a dB either way; or in these, less by what a fan differs
@@ -132,12 +132,12 @@ class Workbench:
 
     def explained(self, model: EchoModel) -> bool:
         """Whether a model leaves so little while the robot is heard that nothing further can be told in it."""
-        return self.heard(model) <= self.criteria.heard_db
+        return self.off_db(model) <= self.criteria.heard_db
 
     def little(self, model: EchoModel, start: EchoModel) -> bool:
         """Whether a model leaves so little of what start leaves that the right effects may be in it."""
         share = _over_fan(self.score(model).active_db) / max(_over_fan(self.score(start).active_db), 1e-12)
-        return self.heard(model) <= self.criteria.little_db and share <= self.criteria.nothing
+        return self.off_db(model) <= self.criteria.little_db and share <= self.criteria.nothing
 
     def left(self, model: EchoModel) -> float:
         """Level in dB over that of the silences."""

@@ -58,7 +58,7 @@ class Measurement:
     recording: Samples
     noise_psd: Samples | None = None
     fit: NDArray[np.bool_] | None = None
-    _heard: dict[VoiceModel, tuple[Samples, Samples]] = field(default_factory=dict, init=False, repr=False)
+    _predicted: dict[VoiceModel, tuple[Samples, Samples]] = field(default_factory=dict, init=False, repr=False)
     _done: dict[tuple[object, VoiceModel], Any] = field(default_factory=dict, init=False, repr=False)
 
     @property
@@ -85,15 +85,15 @@ class Measurement:
         """The recording, whitened, (n,)."""
         return self.whiten(self.recording)
 
-    def heard(self, model: VoiceModel) -> tuple[Samples, Samples]:
+    def predicted(self, model: VoiceModel) -> tuple[Samples, Samples]:
         """What a model predicts for the reference, and that whitened, (n,) each; remembered, not to be written to."""
-        known = self._heard.pop(model, None)
+        known = self._predicted.pop(model, None)
         if known is None:
             predicted = model.predict(self.reference)
             known = predicted, self.whiten(predicted)
-            while len(self._heard) >= REMEMBERED:
-                del self._heard[next(iter(self._heard))]
-        self._heard[model] = known
+            while len(self._predicted) >= REMEMBERED:
+                del self._predicted[next(iter(self._predicted))]
+        self._predicted[model] = known
         return known
 
     def once(self, work: Callable[[Measurement, VoiceModel], Result], model: VoiceModel) -> Result:

@@ -127,7 +127,7 @@ def test_rounds_lower_the_error_of_what_was_fitted_in_turn() -> None:
     for name in names:
         in_turn = in_turn.fit(name, measurement)
     jointly = fit_jointly(measurement, EchoModel(path()), names)
-    left = [measurement.error(measurement.heard(model)[0]) for model in (in_turn, jointly)]
+    left = [measurement.error(measurement.predicted(model)[0]) for model in (in_turn, jointly)]
     assert left[1] < 0.97 * left[0]  # most of what is left is the fan
 
 

@@ -109,7 +109,7 @@ class Fragile(Effect):
     def fit(self, measurement, model):
         if self.failures:
             raise self.failures.pop()
-        predicted, white = measurement.heard(model)[1], measurement.white_recording
+        predicted, white = measurement.predicted(model)[1], measurement.white_recording
         late = np.append(0, predicted[:-1]) * measurement.weights
         return {"amount": float(np.clip(np.dot(white - predicted, late) / np.dot(late, late), -1, 1))}
 

@@ -85,6 +85,27 @@ def test_what_is_nearer_is_named_only_where_it_holds(happened, holds: bool) -> N
     assert answer.left_db < 0.8 if holds else answer.left_db > 3.0  # what a diagnosis calls explained, and much
 
 
+def follower(x: np.ndarray) -> np.ndarray:
+    """A compressor of another design, (n,): 2.5 to 1 above -30 dB of an envelope that rises in 8 ms and falls in 250."""
+    rises, falls = np.exp(-1.0 / (np.array([8e-3, 0.25]) * SAMPLE_RATE))
+    envelope, level = np.empty(x.size), 0.0
+    for at, now in enumerate(np.abs(x).tolist()):
+        keep = rises if now > level else falls
+        level = envelope[at] = keep * level + (1.0 - keep) * now
+    over_db = np.maximum(20.0 * np.log10(envelope + 1e-9) + 30.0, 0.0)
+    return (x * 10.0 ** (-0.6 * over_db / 20.0)).astype(np.float32)
+
+
+def test_a_law_that_loud_words_have_taught_holds_though_it_errs_in_the_softest_sound() -> None:
+    x = voice(12.0)
+    inquiry = Inquiry(profile(), [("playback_gain",), ("compression",)], record(follower(x)), x)
+    sound = menu(x)["noise, 20 dB softer"]
+    heard = inquiry.hear(record(follower(np.pad(sound, (0, SAMPLE_RATE))), seed=5), sound)
+    answer = inquiry.answer([heard], [inquiry.gains(sound)], ("noise",))
+    assert answer.first.name == "compression" and answer.holds
+    assert answer.in_answer and answer.left_db > 1.0
+
+
 @pytest.mark.slow
 def test_what_does_not_hold_is_not_asked_further() -> None:
     x = voice(4.0)

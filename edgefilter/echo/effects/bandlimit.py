@@ -87,7 +87,7 @@ class Bandlimit(Effect):
         Where the power does not end there, what is common with the reference is hidden by something else, such as a codec's
         noise: then the cut-off is where the power ends.
         """
-        predicted, x = measurement.heard(model)
+        predicted, x = measurement.predicted(model)
         found = spectra(measurement, x, 20.0)
         turned = found.cross[:, None] * np.exp(2j * np.pi * np.outer(found.hz, DELAYS) / SAMPLE_RATE)
         turned = np.concatenate((turned.real, turned.imag))

@@ -54,7 +54,7 @@ class ChassisResonance(Effect):
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Frequency and Q by a search in the whitened cross-spectrum, gain and phase by least squares; if it pays, another mode."""
-        predicted, white = measurement.heard(model)
+        predicted, white = measurement.predicted(model)
         coarse, fine = (spectra(measurement, white, resolution_hz) for resolution_hz in (1.0, 0.1))
         residual = measurement.white_recording - white
         modes: list[tuple[float, float]] = []

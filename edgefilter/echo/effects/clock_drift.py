@@ -49,7 +49,7 @@ class ClockDrift(Effect):
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """A robust line through the lags of all blocks, then once more on the prediction that it has straightened."""
-        predicted, recording = measurement.heard(model)[0], measurement.white_recording
+        predicted, recording = measurement.predicted(model)[0], measurement.white_recording
         n = np.arange(predicted.size)
         lag: Array = np.zeros(predicted.size)
         for size, reach in PASSES:

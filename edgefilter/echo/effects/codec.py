@@ -72,7 +72,7 @@ class Codec(Effect):
         """
         if measurement.noise_psd is None:
             return neutral(self)
-        predicted, target = measurement.heard(model)[1], measurement.white_recording
+        predicted, target = measurement.predicted(model)[1], measurement.white_recording
         over, voice = band_power(target - predicted), band_power(predicted)
         use = frames_to_fit(measurement.fit, len(over))
         loud = use & (voice.mean(axis=1) > HEARD)

@@ -71,7 +71,7 @@ class DelayJump(Effect):
 
         How many and how high comes from the samples to fit on; where exactly each lies from all, since it may fall between these.
         """
-        predicted, recording = measurement.heard(model)[1], measurement.white_recording
+        predicted, recording = measurement.predicted(model)[1], measurement.white_recording
         track = track_lag(predicted, recording, measurement.fit, BLOCK, REACH)
         if track.lag.size < 4:
             return neutral(self)

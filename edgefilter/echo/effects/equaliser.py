@@ -65,7 +65,7 @@ class Equaliser(Effect):
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Gauss-Newton in the gains of all knots and the delay, in the whitened cross-spectrum; then taps."""
-        x = measurement.heard(model)[1]
+        x = measurement.predicted(model)[1]
         found = spectra(measurement, x, SAMPLE_RATE / FFT)
         knots, delay = _smooth_gain(found)
         gain_db = np.clip(knots * (20.0 / np.log(10.0)), -MOST_DB, MOST_DB)

@@ -49,7 +49,7 @@ class FanNoise(Effect):
         known = measurement.noise_psd
         if known is None:
             return neutral(self)
-        voice = absorbed(measurement.heard(model)[0], measurement.recording, measurement.fit)
+        voice = absorbed(measurement.predicted(model)[0], measurement.recording, measurement.fit)
         size = 2 * (known.size - 1)
         residual = periodograms(measurement.recording - voice, size)
         if not len(residual):

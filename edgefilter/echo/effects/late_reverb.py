@@ -89,7 +89,7 @@ def fit_path(measurement: Measurement, model: VoiceModel) -> tuple[Array, float]
     Least squares in the whitened domain, slightly regularised, then once more with taps that are expected to decay as the
     room that was found does: some seconds of speech do not teach ten thousand.
     """
-    x = measurement.heard(model)[1]
+    x = measurement.predicted(model)[1]
     residual = measurement.white_recording - x
     length = min(LONGEST, measurement.recording.size // 4)
     taps = fit_supported(x, residual, measurement.weights, LEAD, np.full(length, EXPECTED))

@@ -94,7 +94,7 @@ class MicAgc(Effect):
         The latter by penalised least squares of the gain at the knots, from the voice where it sounds, else from the fan's
         power: a smoothing spline of first order (Eilers & Marx 1996, with second differences), which bridges what is not fitted.
         """
-        heard, predicted = measurement.heard(model)
+        heard, predicted = measurement.predicted(model)
         recording = measurement.white_recording
         voice = absorbed(predicted, recording, measurement.fit)
         overall = level_ratio(voice, predicted)

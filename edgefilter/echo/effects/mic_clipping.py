@@ -43,7 +43,7 @@ class MicClipping(Effect):
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """The level and hardness that leave the least of the whitened recording, a gain free in each; neutral where none does."""
-        predicted, recording = measurement.heard(model)[0], measurement.white_recording
+        predicted, recording = measurement.predicted(model)[0], measurement.white_recording
         chosen = measurement.weights
         top = float(np.max(np.abs(measurement.recording), initial=0.0))
         if top <= 1e-4:

@@ -78,7 +78,7 @@ class MultibandCompression(Effect):
 
         Neutral where the bands' gains do not follow their levels.
         """
-        crossed = find_crossovers(spectra(measurement, measurement.heard(model)[1], RESOLUTION_HZ))
+        crossed = find_crossovers(spectra(measurement, measurement.predicted(model)[1], RESOLUTION_HZ))
         if crossed is None:
             return neutral(self)
         low, high, delay = crossed

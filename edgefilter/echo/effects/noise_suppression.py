@@ -88,7 +88,7 @@ class NoiseSuppression(Effect):
         """Least squares over the cells, the fan's variance 1 in each: the gains at the knots times what the loud cells of the band have."""
         if measurement.noise_psd is None:
             return neutral(self)
-        voice = measurement.heard(model)[0]
+        voice = measurement.predicted(model)[0]
         cells = Cells(measurement, voice, measurement.weights > 0.0)
         knots = KNOTS_DB.size - 1
         step = (np.eye(knots) - np.eye(knots, k=1)) / TRUST

@@ -145,7 +145,7 @@ class Steps:
 
 def _steps(measurement: Measurement, model: VoiceModel) -> Steps | None:
     """The equations; None where the voice is not predicted, or no block of it is missing."""
-    psd, heard = measurement.noise_psd, measurement.heard(model)[1]
+    psd, heard = measurement.noise_psd, measurement.predicted(model)[1]
     if psd is None or heard.size < 8 * TAPS:
         return None
     left = measurement.white_recording - heard

@@ -57,7 +57,7 @@ class PathChange(Effect):
 
         The moment alone is chosen on all samples, since it may fall between those that the fit may use.
         """
-        x = measurement.heard(model)[1]
+        x = measurement.predicted(model)[1]
         residual = measurement.white_recording - x
         time = _step(residual, x)
         for _ in range(2):

@@ -26,7 +26,7 @@ class PlaybackGain(Effect):
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """The least-squares gain of the whitened prediction, held within the bounds."""
-        predicted = measurement.heard(model)[1] * measurement.weights
+        predicted = measurement.predicted(model)[1] * measurement.weights
         gain = level_ratio(measurement.white_recording, predicted)
         return within(self, {"gain_db": 20.0 * np.log10(max(gain, 1e-3))})
 

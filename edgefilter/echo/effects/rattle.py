@@ -100,7 +100,7 @@ class Rattle(Effect):
         filter of the voice does.
         """
         x = measurement.reference
-        predicted, target = measurement.heard(model)[1], measurement.white_recording
+        predicted, target = measurement.predicted(model)[1], measurement.white_recording
         left = target - absorbed(predicted, target, measurement.fit)
         trigger, told = find_trigger(x, left, predicted, measurement.fit)
         if trigger is None:

@@ -83,7 +83,7 @@ class SpeakerNonlinearity(Effect):
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Least squares in the whitened domain; neutral where no law holds on samples that it was not fitted to."""
-        linear, x = measurement.heard(model)[1], measurement.reference
+        linear, x = measurement.predicted(model)[1], measurement.reference
         found = fit_laws(
             x,
             measurement.white_recording,

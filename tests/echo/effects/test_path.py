@@ -64,7 +64,7 @@ def test_late_reverberation_and_its_time_are_found() -> None:
 def test_what_is_known_of_a_decaying_room_helps_where_little_was_heard() -> None:
     office, model = in_an_office(6.0), EchoModel(path())
     left, values = excess_db("late_reverb", office)
-    x = office.heard(model)[1]
+    x = office.predicted(model)[1]
     flat = fit_filter(
         x,
         office.white_recording - x,

@@ -1,0 +1,43 @@
+"""What each engine makes of the demonstration, and several that take turns: as it was before."""
+
+import numpy as np
+import pytest
+import soundfile
+
+from edgefilter import EgoFilter, Profile
+from edgefilter.engines import create
+from edgefilter.engines.combined import Ladder, climbable
+from edgefilter.filter.budget import DEMO
+from edgefilter.filter.stream import Stream
+from tests.as_before import levels_db, same_as_before
+
+
+def demo() -> tuple[np.ndarray, np.ndarray, Profile]:
+    mic, ref = (
+        soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0][: 10 * 16000] for name in ("mic", "reference")
+    )
+    return mic, ref, Profile.load(DEMO / "profile.npz")
+
+
+@pytest.mark.parametrize("engine", ["paper-ss", "ss", "crnn"])
+def test_alone(engine: str) -> None:
+    mic, ref, profile = demo()
+    ego, out, probability = EgoFilter(profile, engine), [], []
+    for at in range(0, ref.size, 2000):
+        out.append(ego.process(mic[at : at + 2000], ref[at : at + 2000]))
+        probability.append(ego.speech_probability)
+    out.append(ego.flush())
+    same_as_before(f"engine_{engine}", {"out": levels_db(np.concatenate(out), 0.125), "probability": probability}, 0.05)
+
+
+def test_in_turn() -> None:
+    """From the best to the cheapest, back, and back again before the crossfade has ended."""
+    mic, ref, profile = demo()
+    ladder = Ladder(climbable(create("crnn", profile), profile))
+    wanted = {40: len(ladder.rungs) - 1, 80: 0, 130: len(ladder.rungs) - 1, 132: 0, 160: 1, 170: len(ladder.rungs) - 1}
+    hop, out = ladder.stft.hop, []
+    stream = Stream(ladder, profile)
+    for count, at in enumerate(range(0, ref.size, hop)):
+        ladder.wanted = wanted.get(count, ladder.wanted)
+        out.append(stream.process(mic[at : at + hop], ref[at : at + hop]))
+    same_as_before("engines_in_turn", {"out": levels_db(np.concatenate(out), hop / 16000)[:220]}, 0.05)
