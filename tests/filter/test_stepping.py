@@ -108,6 +108,20 @@ def test_stepping_between_different_look_aheads_keeps_every_sample_in_its_place(
     np.testing.assert_allclose(out, mic, atol=1e-6)  # float32 rounding of the blend
 
 
+class LateAndQuiet(Late):
+    """A tenth of the microphone, two frames later."""
+
+    def step(self, frame, state):
+        output, state = super().step(frame, state)
+        return Output(output.spectrum * np.float32(0.1)), state
+
+
+def test_a_ladder_gets_to_a_rung_that_looks_ahead():
+    mic = np.full(20_000, 0.5, np.float32)
+    out = run(Stream(Ladder((Bypass(), LateAndQuiet()))), mic, np.zeros_like(mic), {20: 1})
+    np.testing.assert_allclose(out[(22 + DOWN + 3) * HOP : -HOP], 0.05, atol=1e-6)
+
+
 def test_alignment_and_linear_stage_run_on_through_a_step():
     """Outside of the crossfades the output is that of the engine in use, as if it had been alone from the start."""
     mic, ref = conformance.conversation(60_000)
@@ -156,7 +170,7 @@ def test_a_request_during_a_crossfade_turns_it_back():
 
 def test_rungs_that_cannot_take_turns_are_refused():
     with pytest.raises(UsageError, match="bypass and linear cannot take turns"):
-        Ladder((Bypass(), Linear()))
+        Ladder((Bypass(), Quiet(), Linear()))
     with pytest.raises(UsageError, match="STFT"):
         Ladder((Linear(), Linear(StftConfig(n_fft=512, hop=128))))
     with pytest.raises(UsageError, match="no engine"):

@@ -109,9 +109,10 @@ def test_enhance_lowers_a_purely_linear_echo_by_20_db():
     )  # a plain delay; 26 dB and more were seen
 
 
-def test_adapted_profile_needs_a_linear_stage():
-    with pytest.raises(SignalError, match="linear stage"):
-        EgoFilter(engine="bypass").adapted_profile()
+@pytest.mark.parametrize("engine", ["bypass", "linear"])
+def test_adapted_profile_needs_a_profile_and_a_linear_stage(engine):
+    with pytest.raises(SignalError, match="give a profile and an engine with a linear stage"):
+        EgoFilter(engine=engine).adapted_profile()
 
 
 class Talkative(Bypass):
