@@ -183,6 +183,30 @@ def test_a_recogniser_behind_the_stream_adapter_gets_the_finished_turn_of_an_arr
     assert ears.duplex.listeners == []
 
 
+def test_each_event_tells_how_long_the_human_has_spoken_or_been_silent(pair):
+    profile, sound = pair
+    ears = EgoProcessor(EgoFilter(profile, "crnn"), mic_channels=[1, 2])
+
+    async def watch():
+        stream = ears.vad().stream()
+        for at in range(0, len(sound) - 319, 320):
+            pcm = np.rint(sound[at : at + 320] * 32768).astype("<i2").tobytes()
+            stream.push_frame(through(ears, rtc.AudioFrame(pcm, 16_000, 3, 320)))
+            await asyncio.sleep(0.001)
+        stream.end_input()
+        return [event async for event in stream]
+
+    events = asyncio.run(asyncio.wait_for(watch(), 120))
+    frames = [event for event in events if event.type.value == "inference_done"]
+    (end,) = [event for event in events if event.type.value == "end_of_speech"]
+    spoke = [event for event in frames if event.speaking]
+    assert [event.speech_duration for event in spoke] == pytest.approx(0.02 * np.arange(1, len(spoke) + 1))
+    assert end.speech_duration == pytest.approx(0.02 * len(spoke))
+    silent = [event for event in frames if event.samples_index < spoke[0].samples_index]
+    assert [event.silence_duration for event in silent] == pytest.approx(0.02 * np.arange(1, len(silent) + 1))
+    assert {event.speech_duration for event in silent} == {0.0}
+
+
 def test_the_loopback_of_the_device_is_the_reference_where_it_is_named(talking):
     profile, sound = talking
     ears = EgoProcessor(EgoFilter(profile, "linear"), mic_channels=[1, 2], reference_channel=0)
