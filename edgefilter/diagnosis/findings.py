@@ -10,12 +10,14 @@ from edgefilter.diagnosis.ordinary import p_value
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.result import Finding, Interval
 from edgefilter.diagnosis.score import Scorer, share_of
-from edgefilter.diagnosis.trials import Found, Trial
+from edgefilter.diagnosis.trials import Found, Trial, less
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.recording import BLOCK
 from edgefilter.errors import UsageError
 
+HELD = "; the profile holds this effect with other values"
+"""Behind the evidence of an effect that has changed."""
 THIRDS_T = 1.69
 """90 % quantile of Student's t with 2 degrees of freedom over the square root of 3: the interval from three fits to a
 third each."""
@@ -29,7 +31,7 @@ def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[t
     """
     findings, doubts, before, scorer = [], [], found.base.excess_db, Scorer(found.prepared)
     for step in found.steps:
-        without_db = scorer.of(found.model.without_effect(step.name)).level_db
+        without_db = scorer.of(less(found.start, found.model, step.name)).level_db
         after = found.final.excess_db if step is found.steps[-1] else step.score.excess_db
         if progress:
             progress(f"how well {step.name} is known")
@@ -44,8 +46,11 @@ def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[t
                 excess_after_db=after,
                 share=max(share_of(found.base.excess_db, after) - share_of(found.base.excess_db, before), 0.0),
                 parameters=intervals,
-                evidence=find(step.name).sentence(step.values)
-                or f"with {step.name} the held-out residual falls by {step.gain_db:.2f} dB",
+                evidence=(
+                    find(step.name).sentence(step.values)
+                    or f"with {step.name} the held-out residual falls by {step.gain_db:.2f} dB"
+                )
+                + (HELD if step.name in dict(found.start.effects) else ""),
                 values=step.values,
                 prediction=step.score.prediction,
             )

@@ -128,7 +128,8 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     block = SAMPLE_RATE // 50
     level = all_block_power(whiten(predicted, known), block)
     active = np.repeat(maximum_filter1d(level, 11) > 10 ** (SILENCE_DB / 10), block)[:n]
-    psd = known * np.float32(fan_scale(white_y[~active]))
+    scale = np.float32(fan_scale(white_y[~active]))
+    psd, calibrated = known * scale, floored(profile.noise_psd).astype(np.float32) * scale
     human = find_talk(white_y**2 * (known[1] / psd[1]), active)
     usable = np.ones(n, bool)
     for first, last in human:
@@ -142,7 +143,8 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     if len(pieces) > 1:
         lags = ", ".join(f"{lag:.1f} from {first / SAMPLE_RATE:.1f} s" for first, _, lag in pieces)
         warnings += (f"the utterances lag by different numbers of samples: {lags}; aligned one by one",)
-    measurement, ordinary = Measurement(x, y, psd, fitted_blocks(n) & usable), ordinary_distortion(profile, predicted)
+    measurement = Measurement(x, y, psd, fitted_blocks(n) & usable, calibrated)
+    ordinary = ordinary_distortion(profile, predicted)
     return Prepared(measurement, model, predicted, usable, active, offset, human, warnings, ordinary)
 
 

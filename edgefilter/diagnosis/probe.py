@@ -194,11 +194,11 @@ class Inquiry:
         if self._first.model.timed or one.model.timed:
             return one
         known = [part.measurement for part in parts]
-        joined = Measurement(
-            np.concatenate([each.reference for each in known]),
-            np.concatenate([each.recording for each in known]),
-            self._first.noise_psd,
-            np.concatenate([part.fit for part in parts]),
+        joined = replace(
+            self._first.measurement,
+            reference=np.concatenate([each.reference for each in known]),
+            recording=np.concatenate([each.recording for each in known]),
+            fit=np.concatenate([part.fit for part in parts]),
         )
         return replace(one, model=_fitted(joined, start, one.effects))
 

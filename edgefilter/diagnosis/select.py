@@ -30,7 +30,7 @@ def search(
     without: Collection[str] = (),
 ) -> Found:
     """Add effects, others than those named in without, to model as long as held-out samples say that they are there."""
-    bench = Workbench(prepared, criteria, progress, without)
+    bench = Workbench(prepared, criteria, progress, without, model)
     best = _best(bench, model, list(_runs(bench, model)))
     steps = _in_steps(bench, model, best)
     full = len(added(model, best)) >= criteria.most_effects and not bench.explained(best)
@@ -131,7 +131,7 @@ def refit(bench: Workbench, start: EchoModel, model: EchoModel, goal_db: float =
     for _ in range(bench.criteria.rounds):
         before = bench.score(model).level_db
         for name in waiting:
-            again = bench.attempt(name, model.without_effect(name))
+            again = bench.attempt(name, bench.less(model, name))
             if again is not None and again.score.level_db < bench.score(model).level_db - 0.5 * worth:
                 model = again.model
         reached = bench.score(model).level_db
@@ -147,7 +147,7 @@ def backward(bench: Workbench, start: EchoModel, model: EchoModel, newest: str) 
     for name in earlier:
         model = _exchange(bench, start, model, name)
     for name in [name for name in earlier if name in dict(model.effects)]:
-        alone = bench.attempt(newest, model.without_effect(name).without_effect(newest))
+        alone = bench.attempt(newest, bench.less(bench.less(model, name), newest))
         if alone is None:
             continue
         gain_db = alone.score.level_db - bench.score(model).level_db
@@ -158,7 +158,7 @@ def backward(bench: Workbench, start: EchoModel, model: EchoModel, newest: str) 
 
 def _exchange(bench: Workbench, start: EchoModel, model: EchoModel, name: str) -> EchoModel:
     """The model with another effect instead of that one where, beside the others, the other is the one to name."""
-    others = model.without_effect(name)
+    others = bench.less(model, name)
     trials = bench.attempt_all(others, find(name).complexity)
     rivals = [t for t in trials if t.name != name and not find(t.name).last_resort and bench.admissible(t, others)]
     chosen = bench.preferred([*rivals, bench.beside(name, others, model)])
@@ -175,7 +175,7 @@ def split(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
     for name in added(start, model):
         model = _apart(bench, model, name)
     for name in [name for name in added(start, model) if find(name).flexible]:
-        others = model.without_effect(name)
+        others = bench.less(model, name)
         if len(added(start, model)) > 2 or bench.explained(others):
             break
         model = _with_simpler(bench, start, model, name)
@@ -184,7 +184,7 @@ def split(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
 
 def _apart(bench: Workbench, model: EchoModel, name: str) -> EchoModel:
     """The model with a simple effect beside the one of that name, where its fit has taken that one up as well; or as it is."""
-    effect, values, others = find(name), dict(model.effects)[name], model.without_effect(name)
+    effect, values, others = find(name), dict(model.effects)[name], bench.less(model, name)
     only = effect.only(values)
     bare = others.with_effect(name, only)
     simple = None if only is values else forward(bench, bare, bench.criteria.simple)
@@ -192,13 +192,11 @@ def _apart(bench: Workbench, model: EchoModel, name: str) -> EchoModel:
         return model
     grown = both = simple.model
     for _ in range(bench.criteria.rounds):
-        fitted = bench.attempt(name, grown.without_effect(name))
+        fitted = bench.attempt(name, bench.less(grown, name))
         if fitted is None:
             return model
         both = fitted.model
-        again = bench.attempt(
-            simple.name, both.with_effect(name, effect.only(fitted.values)).without_effect(simple.name)
-        )
+        again = bench.attempt(simple.name, bench.less(both.with_effect(name, effect.only(fitted.values)), simple.name))
         if again is None:
             return model
         grown = again.model
@@ -208,7 +206,7 @@ def _apart(bench: Workbench, model: EchoModel, name: str) -> EchoModel:
 
 def _with_simpler(bench: Workbench, start: EchoModel, model: EchoModel, name: str) -> EchoModel:
     """The model with a simpler effect beside the flexible one of that name, of the two that explain most by themselves, or as it is."""
-    criteria, others = bench.criteria, model.without_effect(name)
+    criteria, others = bench.criteria, bench.less(model, name)
     absent = bench.absent(others, max(find(name).complexity - 1, criteria.simple))
     wanted = [key for key in absent if not (find(key).flexible or find(key).last_resort)]
     useful = [key for key in wanted if (t := bench.attempt(key, model)) is not None and t.gain_db > 0.0]
@@ -222,7 +220,7 @@ def _with_simpler(bench: Workbench, start: EchoModel, model: EchoModel, name: st
             continue
         joint = refit(bench, start, both.model, bench.score(model).level_db - least)
         confirmed = bench.beside(trial.name, model, joint)
-        if confirmed.gain_db >= least and bench.admissible(confirmed, joint.without_effect(trial.name)):
+        if confirmed.gain_db >= least and bench.admissible(confirmed, bench.less(joint, trial.name)):
             return joint
     return model
 
@@ -245,13 +243,13 @@ def _best(bench: Workbench, start: EchoModel, runs: list[EchoModel]) -> EchoMode
 def standing(bench: Workbench, start: EchoModel, run: EchoModel) -> EchoModel:
     """The run without the effects that cannot be named beside its others, the latest first."""
     while fallen := [name for name in added(start, run) if not _stands(bench, run, name)]:
-        run = run.without_effect(fallen[-1])
+        run = bench.less(run, fallen[-1])
     return run
 
 
 def _stands(bench: Workbench, model: EchoModel, name: str) -> bool:
     """Whether an effect can be named beside the model's others."""
-    others = model.without_effect(name)
+    others = bench.less(model, name)
     return bench.admissible(bench.beside(name, others, model), others)
 
 
@@ -277,7 +275,7 @@ def _in_steps(bench: Workbench, start: EchoModel, model: EchoModel) -> tuple[Tri
 
 def _left_without(bench: Workbench, start: EchoModel, model: EchoModel, name: str) -> float:
     """Level in dB that a model leaves without that effect, the others fitted anew: what these could swallow is not its own."""
-    others = model.without_effect(name)
+    others = bench.less(model, name)
     kept = added(start, others)
     if len(kept) != 1:
         return bench.score(refit(bench, start, others)).level_db

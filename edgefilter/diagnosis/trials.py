@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeAlias
 
@@ -92,8 +92,10 @@ class Workbench:
         criteria: Criteria,
         progress: Callable[[str], None] | None = None,
         without: Collection[str] = (),
+        start: EchoModel | None = None,
     ) -> None:
         self.prepared, self.criteria, self._without = prepared, criteria, without
+        self._start = start or prepared.model
         self.scorer = Scorer(prepared)
         self._progress = progress
         self._scores: dict[Signature, Score] = {}
@@ -175,13 +177,15 @@ class Workbench:
     def _attempt(self, name: str, model: EchoModel) -> Trial | None:
         if self._progress:
             self._progress(f"trying {name}")
-        effect = find(name)
+        effect, others = find(name), model.without_effect(name)
         try:
-            values = model.fitted(name, self.scorer.behind(model).measurement)
+            values = others.fitted(name, self.scorer.behind(others).measurement)
         except (UsageError, ArithmeticError, np.linalg.LinAlgError) as error:
             self._failed[name] = f"{name} could not be fitted and was left out: {error}"
             return None
-        return None if vanishes(effect, values) else self.beside(name, model, model.with_effect(name, values))
+        if vanishes(effect, values) and name not in dict(model.effects):
+            return None
+        return self.beside(name, model, model.with_effect(name, values))
 
     def beside(self, name: str, others: EchoModel, model: EchoModel) -> Trial:
         """What the effect of that name explains that model has and others has not."""
@@ -252,7 +256,7 @@ class Workbench:
         found = []
         for name in names_tried:
             alone = self._trials.get((signature(start), name))
-            others = frozenset(other for other, _ in model.effects if other != name)
+            others = frozenset(dict(self.less(model, name).effects))
             short = self.short_of(alone, start) if alone else ""
             found.append(Tried(name, alone, self._alike.get((others, name)), short, self._failed.get(name, "")))
         spared = [name for name in names() if name in self._spared and name not in names_tried]
@@ -271,14 +275,25 @@ class Workbench:
         return not (by_chance or taken_up)
 
     def absent(self, model: EchoModel, most: int) -> list[str]:
-        """Names of the effects that a model has not, that may be tried and whose complexity is at most `most`."""
-        out = {*dict(model.effects), *self._without}
+        """Names of the effects that a model has not, or as the start has them, that may be tried and whose complexity is at most `most`."""
+        out = {*added(self._start, model), *self._without}
         return [name for name in names() if name not in out and find(name).complexity <= most]
+
+    def less(self, model: EchoModel, name: str) -> EchoModel:
+        """The model without what it has of that effect beyond the start."""
+        return less(self._start, model, name)
 
 
 def added(start: EchoModel, model: EchoModel) -> list[str]:
-    """Names of the effects that a model has beyond the start it was made from, the latest last."""
-    return [name for name, _ in model.effects[len(start.effects) :]]
+    """Names of the effects that a model has beyond the start it was made from, or at other values, the latest last."""
+    known = dict(start.effects)
+    return [name for name, values in model.effects if known.get(name) is not values]
+
+
+def less(start: EchoModel, model: EchoModel, name: str) -> EchoModel:
+    """The model without that effect, or with it as the start has it."""
+    kept = tuple(entry for entry in start.effects if entry[0] == name)
+    return replace(model, effects=(*kept, *model.without_effect(name).effects))
 
 
 def signature(model: EchoModel) -> Signature:

@@ -52,12 +52,14 @@ class Measurement:
     noise_psd: (601,) one-sided power spectral density of the fan, full scale^2/Hz, from 0 to 8 kHz; None where it is
     unknown.
     fit: (n,) bool, the samples that a fit may use; the others are held out to test it on. None: all.
+    calibrated_psd: (601,) of the calibration's fan, where the profile has another one by now; None: the same.
     """
 
     reference: Samples
     recording: Samples
     noise_psd: Samples | None = None
     fit: NDArray[np.bool_] | None = None
+    calibrated_psd: Samples | None = None
     _predicted: dict[VoiceModel, tuple[Samples, Samples]] = field(default_factory=dict, init=False, repr=False)
     _done: dict[tuple[object, VoiceModel], Any] = field(default_factory=dict, init=False, repr=False)
 

@@ -20,6 +20,7 @@ from edgefilter.diagnosis.laws import Law
 from edgefilter.diagnosis.passport import ENOUGH_DB, Passport
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.result import Precision, in_order
+from edgefilter.diagnosis.trials import less
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import EdgefilterError
 from edgefilter.profile.data import Profile
@@ -318,6 +319,6 @@ def compare_variants(
     for choice in choices(len(findings)):
         partial = model
         for finding, on in zip(findings, choice, strict=True):
-            partial = partial if on else partial.without_effect(finding.effect)
+            partial = partial if on else less(prepared.model, partial, finding.effect)
         found[choice] = describe(prepared, partial)
     return found

@@ -16,7 +16,7 @@ from edgefilter.diagnosis.proof import HeldOut, Proof, prove
 from edgefilter.diagnosis.proven import diagnose_proven
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import SignalError, UsageError
-from tests.diagnosis.robot_scene import path, profile, record, voice
+from tests.diagnosis.robot_scene import FAN, path, profile, record, voice
 
 DRIFT = {"ppm": 40.0, "offset": 0.0}
 RESONANCE = {"frequency_hz": 640.0, "q": 35.0, "gain_db": -2.0}
@@ -218,3 +218,40 @@ def test_a_drift_in_the_profile_is_predicted_whatever_the_lag() -> None:
     known = profile().with_echo(EchoModel(path()).with_effect("clock_drift", {"ppm": 80.0, "offset": 0.0}))
     for lag in (0.0, 13_000.0):
         assert compare(known, record(x, known.echo, lag), x).excess_db < 0.3, lag
+
+
+HELD = {
+    "playback_gain": ({"gain_db": -3.0}, {"gain_db": -8.0}),
+    "compression": (
+        {"threshold_db": -35.0, "ratio": 2.0, "attack_ms": 5.0, "release_ms": 150.0},
+        {"threshold_db": -40.0, "ratio": 4.0, "attack_ms": 5.0, "release_ms": 150.0},
+    ),
+}
+"""Values that the profile has, and those of today."""
+
+
+@pytest.mark.parametrize("name", HELD)
+def test_an_effect_that_the_profile_holds_is_named_where_its_values_are_others_by_now(name: str) -> None:
+    """A robot whose volume was turned once is turned again: no other effect is what happened."""
+    before, now = HELD[name]
+    x = voice(8.0)
+    knowing = profile().with_echo(profile().echo.with_effect(name, before))
+    diagnosis = diagnose(knowing, record(x, EchoModel(path()).with_effect(name, now)), x)
+    (finding,) = diagnosis.ranking
+    assert diagnosis.verdict == "missing" and finding.effect == name
+    assert finding.evidence.endswith("the profile holds this effect with other values")
+    for parameter, value in now.items():
+        assert finding.parameters[parameter].value == pytest.approx(value, rel=0.05)
+
+
+def test_a_fan_that_the_profile_holds_is_named_by_what_it_is_over_the_calibrated_one() -> None:
+    rng, x = np.random.default_rng(4), voice(8.0)
+    twice = {"spectrum_db": np.full(601, 6.0), "change_db": 6.0}
+    knowing = profile().with_echo(profile().echo.with_effect("fan_noise", twice))
+    louder = record(x) + (FAN * np.sqrt(10**0.9 - 1.0) * rng.standard_normal(x.size)).astype(np.float32)
+    diagnosis = diagnose(knowing, louder, x)
+    (finding,) = diagnosis.ranking
+    assert finding.effect == "fan_noise" and finding.parameters["change_db"].value == pytest.approx(9.0, abs=0.5)
+    better, before, after = add(knowing, "fan_noise", louder, x)
+    assert dict(better.echo.effects)["fan_noise"]["change_db"] == pytest.approx(9.0, abs=0.5)
+    assert before.excess_db > 2.5 and abs(after.excess_db) < 0.3

@@ -53,7 +53,7 @@ def test_a_number_beside_which_the_effect_cannot_be_applied_has_the_scatter_of_t
 
     known = SimpleNamespace(value=-2.0, low=-3.0, high=-1.0)
     finding = SimpleNamespace(effect="playback_gain", values={"gain_db": -2.0}, parameters={"gain_db": known})
-    found = SimpleNamespace(heard=SimpleNamespace(measurement=None), model=SimpleNamespace(with_effect=fails))
+    found = SimpleNamespace(in_noise=SimpleNamespace(measurement=None), model=SimpleNamespace(with_effect=fails))
     (number,) = precision(found, [finding]).numbers
     assert number.source == "thirds"
 

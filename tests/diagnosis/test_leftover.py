@@ -69,7 +69,7 @@ def inspect(residual: np.ndarray, silent_from_s: float = 6.0) -> Leftover:
         measurement=SimpleNamespace(recording=residual),
     )
     model, final = SimpleNamespace(microphone_gain=np.ones), SimpleNamespace(prediction=np.zeros(n, np.float32))
-    return leftover(SimpleNamespace(heard=heard, model=model, final=final))
+    return leftover(SimpleNamespace(in_noise=heard, model=model, final=final))
 
 
 def tones(size: int, *hertz: float) -> np.ndarray:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from edgefilter.diagnosis.select import _in_steps
+from edgefilter.diagnosis.trials import less
 from edgefilter.echo.model import EchoModel
 
 START = EchoModel(np.eye(1, 8, dtype=np.float32)[0])
@@ -28,6 +29,9 @@ class Bench:
     def attempt(self, name: str, model: EchoModel) -> SimpleNamespace:
         assert model is START
         return SimpleNamespace(score=SimpleNamespace(level_db=self.anew[name]))
+
+    def less(self, model: EchoModel, name: str) -> EchoModel:
+        return less(START, model, name)
 
     def beside(self, name: str, others: EchoModel, model: EchoModel) -> SimpleNamespace:
         return SimpleNamespace(name=name, score=self.score(model))

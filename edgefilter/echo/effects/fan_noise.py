@@ -61,7 +61,7 @@ class FanNoise(Effect):
             found = residual[silent].mean(axis=0)
         else:
             found = _quiet_mean(residual[whole] if whole.any() else residual)
-        floor = floored(known)
+        floor = floored(known if measurement.calibrated_psd is None else measurement.calibrated_psd)
         smooth = np.convolve(np.pad(found / floor, 1, mode="edge"), SMOOTH, "valid")
         total = 10.0 * np.log10(np.sum(smooth * floor) / np.sum(floor) + 1e-30)
         return within(self, {"spectrum_db": 10.0 * np.log10(smooth + 1e-30), "change_db": total})
