@@ -19,8 +19,6 @@ DISPLACEMENT_TAPS = 128
 """Length of its impulse response, 8 ms: what comes later is 80 dB below its peak."""
 MOTION_Q = 0.8
 """Of a small driver in its box; from 0.6 to 1 what its distortion explains hardly changes."""
-CHUNK = 16384
-"""Samples of a transform whose responses are worked out at once."""
 MOTION_TAPS = 256
 """Samples in which a membrane of that Q and at least 160 Hz comes to rest, by 87 dB: 16 ms."""
 
@@ -32,8 +30,7 @@ def displacement_taps() -> Array:
     A Butterworth low-pass, sampled in frequency, so that the running filter needs no scipy.signal.
     """
     size = 8 * DISPLACEMENT_TAPS
-    bins = np.arange(size // 2 + 1.0)
-    return fourier.irfft(_responses(bins, size, DISPLACEMENT_HZ, np.sqrt(0.5))[0], size)[:DISPLACEMENT_TAPS]
+    return fourier.irfft(_responses(size, DISPLACEMENT_HZ, np.sqrt(0.5))[0], size)[:DISPLACEMENT_TAPS]
 
 
 def motion(x: Samples, resonance_hz: float, sample_rate: int = SAMPLE_RATE) -> Samples:
@@ -51,18 +48,12 @@ def motion(x: Samples, resonance_hz: float, sample_rate: int = SAMPLE_RATE) -> S
 
 @lru_cache(maxsize=2)
 def _motion(size: int, resonance_hz: float, sample_rate: int) -> Spectrum:
-    """The responses, in pieces, so that memory stays bounded."""
-    pieces = np.array_split(np.arange(size // 2 + 1.0), -(-size // CHUNK))
-    found = (_responses(bins, size, resonance_hz, MOTION_Q, sample_rate).astype(np.complex64) for bins in pieces)
-    return np.concatenate([*found], axis=1)
+    return _responses(size, resonance_hz, MOTION_Q, sample_rate).astype(np.complex64)
 
 
-def _responses(bins: Array, size: int, hz: float, q: float, sample_rate: int = SAMPLE_RATE) -> NDArray[np.complex128]:
-    """Responses from drive to displacement and velocity, of w^2 / (s^2 + s w / Q + w^2) by the bilinear transform, (2, bins).
-
-    bins: of a transform of that size.
-    """
+def _responses(size: int, hz: float, q: float, sample_rate: int = SAMPLE_RATE) -> NDArray[np.complex128]:
+    """Responses from drive to displacement and velocity, of w^2 / (s^2 + s w / Q + w^2) by the bilinear transform, (2, size // 2 + 1)."""
     k = np.tan(np.pi * hz / sample_rate)
-    z = np.exp(-2j * np.pi * bins / size)
+    z = np.exp(-2j * np.pi * np.arange(size // 2 + 1) / size)
     rest = k**2 * (1 + z) ** 2 + k / q * (1 - z**2) + (1 - z) ** 2
     return np.stack((k**2 * (1 + z) ** 2 / rest, k * (1 - z**2) / rest))
