@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edgefilter.alignment.delay_tracker import FRAME, STRIDE, DelayMeasurement, DriftFilter, JumpWitness
+from edgefilter.alignment.delay_line import Tape
+from edgefilter.alignment.delay_tracker import FRAME, STRIDE, DelayMeasurement, DelayMeter, DriftFilter, JumpWitness
 
 
 def look(
@@ -175,3 +176,17 @@ def test_a_small_jump_may_come_from_a_wrong_slope_since_the_last_look(after, off
     drift.advance(16 * STRIDE)
     assert drift.delay == pytest.approx(1000.0 + offset, abs=0.01)
     assert drift.deviation == pytest.approx(np.hypot(0.3, 16 * STRIDE * 1e-6 * wrong_ppm), rel=0.02)
+
+
+@pytest.mark.parametrize("level", [1.0, 1e-3])
+@pytest.mark.parametrize(("far", "error"), [(False, 0.0), (False, 60.0), (False, -60.0), (True, 900.0), (True, -900.0)])
+def test_a_look_finds_how_far_the_delay_is_off_and_whether_another_place_is_the_better_one(far, error, level) -> None:
+    """Of noise and its echo, as late by 500 samples and the error."""
+    rng = np.random.default_rng(3)
+    sound = (0.1 * level * rng.standard_normal(32_000)).astype(np.float32)
+    mic, ref = Tape(32_000), Tape(32_000)
+    ref.push(sound)
+    mic.push(np.roll(sound, 500 + round(error)))
+    found = DelayMeter().measure(mic, ref, 30_000, 500.0, 0.0, far)
+    assert found is not None and found.offset == pytest.approx(error, abs=0.05)
+    assert found.dominance == pytest.approx(1.0) if error == 0.0 else found.dominance > 2.0
