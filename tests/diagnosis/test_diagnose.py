@@ -11,7 +11,7 @@ from scipy import signal
 
 from edgefilter.diagnosis.compare import compare
 from edgefilter.diagnosis.criteria import Criteria
-from edgefilter.diagnosis.diagnose import Diagnosis, add, conclude, diagnose
+from edgefilter.diagnosis.diagnose import Diagnosis, add, conclude, diagnose, holds
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.score import Scorer
 from edgefilter.diagnosis.select import search
@@ -238,6 +238,14 @@ def verdict(active_db: float, fitted_db: float) -> Score:
         np.ones((4, 4)),
         np.zeros(16000, np.float32),
     )
+
+
+@pytest.mark.parametrize(
+    "base_db, left_db, held", [(15.0, 2.9, True), (15.0, 3.1, False), (25.0, 3.1, True), (4.0, 2.1, False)]
+)
+def test_effects_hold_that_leave_less_than_3_db_or_one_percent_and_less_than_half(base_db, left_db, held):
+    found = Found(None, EchoModel(path()), EchoModel(path()), verdict(base_db, base_db), verdict(left_db, left_db), ())
+    assert holds(found, Criteria()) is held
 
 
 @pytest.mark.parametrize(
