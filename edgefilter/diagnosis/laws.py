@@ -374,8 +374,9 @@ def wander(ground: _Ground) -> Law | None:
         lag += _solved((hats * energy) @ hats.T, hats @ cross, bends)[0]
     if not np.isfinite(lag).all():
         return None
-    words = f"a lag that moves between {lag.min():+.2f} and {lag.max():+.2f} samples in the course of the recording"
-    curve = Curve.of("time", "s", np.arange(float(lag.size)), lag, 1.0, "samples")
+    heard = lag[: ground.x.size // SAMPLE_RATE + 1]  # the last knot may lie behind the end
+    words = f"a lag that moves between {heard.min():+.2f} and {heard.max():+.2f} samples in the course of the recording"
+    curve = Curve.of("time", "s", np.arange(float(heard.size)), heard, 1.0, "samples")
     return Law("time", words, ground.stage, curve, LAG.format(lag=_array(lag, 4)), event=True)
 
 
