@@ -184,8 +184,7 @@ def fan_in_silences(recording: Samples, silent: NDArray[np.bool_]) -> tuple[Samp
     whole = frames(silent, GRID_FFT, step).all(axis=1)
     share = 0.5 if whole.sum() >= LEAST_FRAMES else 0.05
     at = np.flatnonzero(whole) if share == 0.5 else np.arange(power.shape[0])
-    level = np.array([np.log(np.maximum(frame, ROUNDING_PSD)).mean() for frame in power])
-    order = at[np.argsort(level[at])]
+    order = at[np.argsort([np.log(np.maximum(power[frame], ROUNDING_PSD)).mean() for frame in at])]
     kept = power[order[: max(int(share * order.size), LEAST_FRAMES // 2)]]
     psd = uniform_filter1d(kept.mean(axis=0), 5, mode="nearest")
     return psd.astype(np.float32), kept.shape[0] * step / SAMPLE_RATE if share == 0.5 else 0.0

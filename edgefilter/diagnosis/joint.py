@@ -41,8 +41,10 @@ def fit_straight(prepared: Prepared, wanted: Sequence[str]) -> tuple[EchoModel, 
     The names of the latter are the second answer: a drift or a turned volume of this recording would spoil the fit of the
     others. Looked for twice, since beside the wrong room it may be hidden.
     """
-    bench, followed = Workbench(prepared, Criteria()), _followed(wanted)
-    model = _straightened(bench, prepared.model, followed)
+    followed = _followed(wanted)
+    start = _without(prepared.model, followed)
+    bench = Workbench(prepared, Criteria(), start=start)
+    model = _straightened(bench, start, followed)
     fitted, order = _forward(bench, model, wanted)
     model = _straightened(bench, fitted, followed)
     found = tuple(name for name in followed if name in dict(model.effects))
@@ -80,9 +82,14 @@ def _followed(wanted: Sequence[str]) -> list[str]:
     return [name for name in names() if find(name).followed and name not in wanted and find(name).family not in left]
 
 
+def _without(model: EchoModel, followed: Sequence[str]) -> EchoModel:
+    """The model without the followed effects, also those that the profile holds: this recording may have others."""
+    return replace(model, effects=tuple(entry for entry in model.effects if entry[0] not in followed))
+
+
 def _straightened(bench: Workbench, model: EchoModel, followed: Sequence[str]) -> EchoModel:
     """The model with only those of the followed effects that held-out samples show: forward, refitted, backward."""
-    start = model = replace(model, effects=tuple(entry for entry in model.effects if entry[0] not in followed))
+    start = model = _without(model, followed)
     while True:
         absent = [name for name in followed if name not in dict(model.effects)]
         trials = [trial for name in absent if (trial := bench.attempt(name, model)) is not None]

@@ -255,3 +255,13 @@ def test_a_fan_that_the_profile_holds_is_named_by_what_it_is_over_the_calibrated
     better, before, after = add(knowing, "fan_noise", louder, x)
     assert dict(better.echo.effects)["fan_noise"]["change_db"] == pytest.approx(9.0, abs=0.5)
     assert before.excess_db > 2.5 and abs(after.excess_db) < 0.3
+
+
+def test_an_effect_is_added_to_a_profile_that_holds_the_volume_of_today() -> None:
+    x, turned = voice(8.0), {"gain_db": -3.0}
+    knowing = profile().with_echo(profile().echo.with_effect("playback_gain", turned))
+    ringing = EchoModel(path()).with_effect("playback_gain", turned).with_effect("chassis_resonance", RESONANCE)
+    better, before, after = add(knowing, "chassis_resonance", record(x, ringing), x)
+    values = dict(better.echo.effects)
+    assert values["playback_gain"]["gain_db"] == -3.0 and 2 * abs(after.excess_db) < before.excess_db
+    assert values["chassis_resonance"]["frequency_hz"] == pytest.approx(RESONANCE["frequency_hz"], rel=0.01)
