@@ -12,7 +12,7 @@ from edgefilter.diagnosis.candidates import candidates
 from edgefilter.diagnosis.closer_look import look_closer
 from edgefilter.diagnosis.compare import Comparison, compare, describe, independence_of
 from edgefilter.diagnosis.criteria import Criteria
-from edgefilter.diagnosis.findings import findings_of
+from edgefilter.diagnosis.findings import evidence_of, findings_of
 from edgefilter.diagnosis.joint import fit_jointly
 from edgefilter.diagnosis.laws import free_law
 from edgefilter.diagnosis.leftover import left_in_words, leftover
@@ -218,7 +218,7 @@ def _as_written(found: Diagnosis, prepared: Prepared, values: Mapping[str, Value
             excess_after_db=left_db,
             share=share,
             parameters={key: interval.at(values[name][key]) for key, interval in finding.parameters.items()},
-            evidence=find(name).sentence(values[name]) or finding.evidence,
+            evidence=evidence_of(name, values[name], prepared.model, finding.evidence),
             values=values[name],
         )
         excess_db = left_db

@@ -12,6 +12,7 @@ from edgefilter.diagnosis.result import Finding, Interval
 from edgefilter.diagnosis.score import Scorer, share_of
 from edgefilter.diagnosis.trials import Found, Trial, less
 from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.measurement import Values
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.recording import BLOCK
 from edgefilter.errors import UsageError
@@ -46,11 +47,12 @@ def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[t
                 excess_after_db=after,
                 share=max(share_of(found.base.excess_db, after) - share_of(found.base.excess_db, before), 0.0),
                 parameters=intervals,
-                evidence=(
-                    find(step.name).sentence(step.values)
-                    or f"with {step.name} the held-out residual falls by {step.gain_db:.2f} dB"
-                )
-                + (HELD if step.name in dict(found.start.effects) else ""),
+                evidence=evidence_of(
+                    step.name,
+                    step.values,
+                    found.start,
+                    f"with {step.name} the held-out residual falls by {step.gain_db:.2f} dB",
+                ),
                 values=step.values,
                 prediction=step.score.prediction,
             )
@@ -59,6 +61,12 @@ def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[t
     voice, noise = ([f for f in findings if (find(f.effect).stage == "noise") is fan] for fan in (False, True))
     first = noise and sum(f.share for f in noise) > sum(f.share for f in voice)
     return tuple((*noise, *voice) if first else (*voice, *noise)), doubts
+
+
+def evidence_of(name: str, values: Values, start: EchoModel, otherwise: str) -> str:
+    """What an effect says of its values, or otherwise; and that the start has it already, where it has."""
+    said = find(name).sentence(values) or otherwise.removesuffix(HELD)
+    return said + (HELD if name in dict(start.effects) else "")
 
 
 def _intervals(prepared: Prepared, model: EchoModel, step: Trial) -> tuple[Mapping[str, Interval], list[str]]:
