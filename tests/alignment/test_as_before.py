@@ -9,11 +9,14 @@ from tests.as_before import levels_db, same_as_before
 
 
 def told(aligner: Aligner, mic: np.ndarray, ref: np.ndarray) -> dict:
-    """Of every fourth hop its delay and state, the level of what is delivered, and the figures at the end."""
+    """Of every fourth hop its figures, the level of what is delivered, and the figures at the end."""
     hops = run(aligner, mic, ref)
     return {
         "delay": [hop.delay for hop in hops[::4]],
         "state": [str(hop.state) for hop in hops[::4]],
+        "confidence": [hop.confidence for hop in hops[::4]],
+        "ppm": [hop.ppm for hop in hops[::4]],
+        "flags": [10 * hop.realigned + hop.at_any_lag for hop in hops[::4]],
         "reference": levels_db(np.concatenate([hop.reference for hop in hops])),
         "stats": aligner.stats(),
     }
@@ -47,6 +50,21 @@ def test_clocks_that_drift_and_a_buffer_that_is_lost(ppm: float) -> None:
     mic, _ = hear(ref, [(0, 2500), (80_000, 2660)], room(rng, 0.3), ppm)
     mic = mic + fan(rng, mic.size, 0.004)
     same_as_before(f"alignment_drift_{ppm:.0f}", told(Aligner(160), mic, ref))
+
+
+@pytest.mark.parametrize("knows", [True, False])
+def test_utterances_that_are_not_heard(knows: bool) -> None:
+    """The third of five alone, and the last one; a human talks meanwhile."""
+    rng = np.random.default_rng(19)
+    ref, onsets = utterances(rng, [1.2, 0.6, 2.0, 1.5, 2.0], [1.0] * 5)
+    heard = np.zeros(ref.size, np.float32)
+    for at in (2, 4):
+        stop = onsets[at + 1] if at < 4 else ref.size
+        heard[onsets[at] : stop] = ref[onsets[at] : stop]
+    mic, _ = hear(heard, [(0, 3300), (onsets[4], 3700)], room(rng, 0.4))
+    mic = mic + 0.2 * speech_like(rng, mic.size / 16000) + fan(rng, mic.size)
+    profile = known_path(room(rng, 0.25)) if knows else None
+    same_as_before(f"alignment_unheard_{'known' if knows else 'unknown'}", told(Aligner(256, profile), mic, ref))
 
 
 def test_an_array_of_three() -> None:

@@ -7,13 +7,16 @@ import numpy as np
 import pytest
 import soundfile
 
-from edgefilter import Profile, diagnose
+from edgefilter import Profile, compare, diagnose
+from edgefilter.diagnosis.joint import fit_straight
 from edgefilter.diagnosis.passport import measure
+from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.probe import Inquiry, menu
+from edgefilter.diagnosis.proof import prove
 from edgefilter.diagnosis.result import Diagnosis
 from edgefilter.echo.model import EchoModel
 from edgefilter.filter.budget import DEMO
-from tests.as_before import same_as_before
+from tests.as_before import levels_db, same_as_before
 from tests.diagnosis.robot_scene import path, profile, record, voice
 
 
@@ -36,7 +39,15 @@ def told(found: Diagnosis) -> dict:
     ]
     curves = known["closer_look"] and known["closer_look"]["curves"]
     plain = ("verdict", "excess_db", "remaining_db", "evidence", "where", "advice", "law", "warnings")
-    return {**{name: known[name] for name in plain}, "ranking": ranking, "tried": tried, "curves": curves}
+    zones = known["independence"]["of_findings"]["zones"] if known["independence"]["of_findings"] else []
+    depends = [(zone["meaning"], zone["share"]) for zone in zones]
+    return {
+        **{name: known[name] for name in plain},
+        "ranking": ranking,
+        "tried": tried,
+        "curves": curves,
+        "depends": depends,
+    }
 
 
 @pytest.mark.parametrize("number", ["one", "two"])
@@ -58,6 +69,12 @@ def with_effect(name: str, **values: float) -> Callable[[np.ndarray], np.ndarray
     return lambda x: record(x, EchoModel(path()).with_effect(name, values))
 
 
+def diffuse() -> np.ndarray:
+    """A path without a direct sound."""
+    decay = np.exp(-np.arange(6400) / 1500)
+    return (0.02 * np.random.default_rng(9).standard_normal(6400) * decay).astype(np.float32)
+
+
 HAPPENED = {
     "trembling": trembling,
     "bent": bent,
@@ -66,20 +83,71 @@ HAPPENED = {
     "elsewhere": lambda x: record(x, EchoModel(path(seed=2))),
     "clipped": lambda x: np.clip(record(x), -0.03, 0.03),
     "later": lambda x: record(x, lag=37.4),
+    "diffuse": lambda x: record(x, EchoModel(diffuse())),
     "expanded": lambda x: record((x * np.minimum(np.abs(x) / 0.1, 1.0) ** 0.5).astype(np.float32)),
 }
 
 
-@pytest.mark.parametrize("what", HAPPENED)
+@pytest.mark.parametrize("what", [what for what in HAPPENED if what != "diffuse"])
 def test_of_a_small_robot(what: str) -> None:
     x = voice(8.0)
     same_as_before(f"diagnosis_{what}", told(diagnose(profile(), HAPPENED[what](x), x)), 0.1, 0.02)
 
 
-@pytest.mark.parametrize("what", ["trembling", "elsewhere", "clipped"])
+@pytest.mark.parametrize("what", ["trembling", "elsewhere", "clipped", "diffuse"])
 def test_of_an_unknown_device(what: str) -> None:
     x = voice(10.0)
     same_as_before(f"passport_{what}", measure(HAPPENED[what](x), x, voice(2.0, seed=5), engines=["linear"]).to_dict())
+
+
+def interrupted(x: np.ndarray) -> np.ndarray:
+    """A human in a pause, twice; what the robot says behind the second one comes 90 samples later."""
+    early, late = (
+        record(part) for part in (x * (np.arange(x.size) < x.size // 2), x * (np.arange(x.size) >= x.size // 2))
+    )
+    y = 0.5 * (early + np.roll(late, 90))
+    for start in (20_000, 68_000):
+        y[start : start + 8000] += 0.02 * np.random.default_rng(8).standard_normal(8000).astype(np.float32)
+    return y
+
+
+@pytest.mark.parametrize("what", ["bent", "elsewhere", "later", "turned_down", "interrupted"])
+def test_of_a_comparison(what: str) -> None:
+    """What is heard and said before the first and behind the last whole word is cut off from some."""
+    x = voice(9.0, seed=4)
+    at = np.arange(x.size) % 48_000
+    x[(at > 16_000) & (at < 36_000)] = 0.0
+    y = interrupted(x) if what == "interrupted" else HAPPENED[what](x)
+    if what in ("later", "bent"):
+        x = np.where((np.arange(x.size) > 9000) & (np.arange(x.size) < 120_000), x, 0.0).astype(np.float32)
+    prepared = prepare(profile(), y, x)
+    masks = {"usable": prepared.usable, "active": prepared.active, "fit": prepared.measurement.fit}
+    found = compare(profile(), y, x).to_dict()
+    turns = {name: np.flatnonzero(np.diff(mask.astype(int))) for name, mask in masks.items()}
+    same_as_before(f"comparison_{what}", {**found, **turns, "prediction": levels_db(prepared.prediction)})
+
+
+@pytest.mark.parametrize("names", [("late_reverb",), ("playback_gain", "speaker_nonlinearity")])
+def test_of_effects_that_are_added(names: tuple[str, ...]) -> None:
+    """The path's filter, in energy of forty parts, each value, and what the running filter gains by them."""
+    x = voice(10.0, seed=6)
+    y = record((np.tanh(6.0 * x) / 9.0).astype(np.float32), EchoModel(path(seed=4)))
+    model, straightened = fit_straight(prepare(profile(), y, x), names)
+    values = {
+        f"{name}.{key}": value if np.size(value) < 9 else [float(np.sum(part**2)) for part in np.array_split(value, 40)]
+        for name, known in model.effects
+        for key, value in known.items()
+    }
+    proof = prove(profile(), names, y, x)
+    found = {"values": values, "straightened": straightened, "proof": proof.to_dict(), "without": proof.without}
+    same_as_before(f"added_{names[-1]}", found, 0.01, 0.01)
+
+
+def test_of_sounds_that_are_played() -> None:
+    """Their level in steps of 50 ms, and that of their differences, which tells the spectrum."""
+    sounds = menu(voice(6.0))
+    found = {what: [levels_db(part, 0.05) for part in (x, np.diff(x))] for what, x in sounds.items()}
+    same_as_before("sounds", found)
 
 
 def test_of_two_explanations() -> None:

@@ -45,6 +45,8 @@ SCENES = {
     "moved": {"moved": 9},
     "lag": {"lag": 700, "ppm": 60.0},
     "repeats": {"human_db": -3.0, "repeats": True},
+    "whisper": {"volume": 0.02},
+    "shout": {"volume": 30.0, "human_db": -20.0},
 }
 """What happens in the middle of each, as Scene has it."""
 
@@ -53,6 +55,23 @@ SCENES = {
 def test_of_a_robot_to_which_something_happens(what: str) -> None:
     scene = Scene(8.0, **SCENES[what])
     same_as_before(f"filter_{what}", told(EgoFilter(engine="crnn"), scene.mic, scene.reference), 0.3, 1e-3)
+
+
+REFERENCES = {
+    "late": lambda x: np.pad(x, (8000, 0))[: x.size],
+    "another": lambda x: np.roll(x[::-1], 5000),
+    "silent": np.zeros_like,
+    "cut": lambda x: np.where(np.arange(x.size) % 24_000 < 12_000, x, 0.0).astype(np.float32),
+    "louder": lambda x: np.clip(20.0 * x, -1.0, 1.0),
+}
+"""What is handed over for what the robot said."""
+
+
+@pytest.mark.parametrize("what", REFERENCES)
+def test_of_a_reference_that_is_wrong(what: str) -> None:
+    scene = Scene(12.0, human_db=-6.0)
+    reference = REFERENCES[what](scene.reference)
+    same_as_before(f"filter_reference_{what}", told(EgoFilter(engine="linear"), scene.mic, reference), 0.3, 1e-3)
 
 
 def test_of_an_array_with_a_microphone_that_breaks() -> None:
