@@ -6,7 +6,7 @@ import soundfile
 
 from edgefilter import EgoFilter, Profile
 from edgefilter.engines import create
-from edgefilter.engines.combined import Ladder, climbable
+from edgefilter.engines.combined import Ladder, climbable, with_network_as_judge
 from edgefilter.filter.budget import DEMO
 from edgefilter.filter.stream import Stream
 from tests.as_before import levels_db, same_as_before
@@ -28,6 +28,23 @@ def test_alone(engine: str) -> None:
         probability.append(ego.speech_probability)
     out.append(ego.flush())
     same_as_before(f"engine_{engine}", {"out": levels_db(np.concatenate(out), 0.125), "probability": probability}, 0.05)
+
+
+def test_with_another_lag() -> None:
+    """The paper's alignment has to find where the reference is."""
+    mic, ref, profile = demo()
+    ego = EgoFilter(profile, "paper-ss")
+    out = np.concatenate((ego.process(mic, np.pad(ref, (3000, 0))[: ref.size]), ego.flush()))
+    same_as_before("engine_paper-ss_later", {"out": levels_db(out), "alignment": ego.stats()["alignment"]}, 0.05)
+
+
+def test_with_the_network_as_judge() -> None:
+    mic, ref, profile = demo()
+    stream, probability = Stream(with_network_as_judge(create("ss", profile), profile), profile), []
+    for at in range(0, ref.size, 2000):
+        stream.process(mic[at : at + 2000], ref[at : at + 2000])
+        probability.append(stream.speech_probability)
+    same_as_before("engine_judged", {"probability": probability}, 0.05)
 
 
 def test_in_turn() -> None:

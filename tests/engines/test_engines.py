@@ -9,9 +9,9 @@ from edgefilter import engines
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import SignalError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter, enhance
-from edgefilter.filter.stream import Stream
+from edgefilter.filter.stream import Stream, step
 from edgefilter.profile.data import Profile
-from edgefilter.types import PRE_ROLL
+from edgefilter.types import PRE_ROLL, Frame, Output
 from tests import conformance
 
 DATA = Path(__file__).parents[1] / "data"
@@ -72,3 +72,15 @@ def test_messages_about_the_linear_stage_name_every_engine_that_has_one():
     assert {name for name, made in classes.items() if made.front == "full"} == set(engines.HAVE_LINEAR_STAGE)
     with pytest.raises(SignalError, match=r"\(crnn, ss, linear\)"):
         EgoFilter(engine="bypass").adapted_profile()
+
+
+def test_nobody_speaks_while_the_robot_may_arrive_at_any_lag():
+    class Sure(engines.linear.Bypass):
+        def step(self, frame, state):
+            return Output(frame.error, 1.0), None
+
+    zeros, some = np.zeros(257, np.float32), np.full(257, 0.5 + 0j, np.complex64)
+    frame = Frame(some, some, some, some, zeros + 1e-4, zeros)
+    assert step(Sure(), frame, None)[0].speech_probability == 1.0
+    output, _ = step(Sure(), frame._replace(at_any_lag=True), None)
+    assert output.speech_probability == 0.0 and np.abs(output.spectrum).max() < 0.02

@@ -97,6 +97,12 @@ def test_an_engine_that_cannot_keep_up_never_fits(measured):
     assert not choice.fits and choice.engine == "linear" and "faster processor" in choice.reason
 
 
+def test_no_budget_is_proposed_that_is_longer_than_a_hop(measured):
+    measured[0].update(ss=30.0, linear=20.0)
+    choice = choose(1.0, candidates=("ss", "linear"))
+    assert "faster processor" in choice.reason and "--budget-ms" not in choice.reason
+
+
 def test_an_engine_that_cannot_be_made_is_skipped_and_named(measured):
     choice = choose(8.0, candidates=("paper-ss", "linear"))
     assert (

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from edgefilter import EgoFilter, PathLearner, Profile
+from edgefilter import EgoFilter, PathLearner, Profile, self_calibrate
 from tests.as_before import levels_db, same_as_before
 from tests.learning.scenes import Scene
 
-SCENES = {"alone": {}, "moved": {"moved": 9}, "human": {"human_db": -6.0}}
+SCENES = {"alone": {}, "moved": {"moved": 9}, "human": {"human_db": -6.0}, "elsewhere": {}}
+"""The last with a profile of another room."""
 
 
 @pytest.mark.parametrize("what", SCENES)
@@ -15,7 +16,9 @@ def test_of_a_loudspeaker(what: str, tmp_path) -> None:
     scene = Scene(16.0, **SCENES[what])
     file = tmp_path / "robot.npz"
     learner = PathLearner(remember=file)
-    with EgoFilter(engine="linear", learn=learner) as ego:
+    before = Scene(8.0, moved=4).part(4.0, 8.0)
+    profile = self_calibrate(before.mic, before.reference) if what == "elsewhere" else None
+    with EgoFilter(profile, "linear", learn=learner) as ego:
         out = ego.process(scene.mic, scene.reference)
         events = [(one.kind, one.sample, one.detail) for one in ego.events()]
     known = Profile.load(file) if file.exists() else None
