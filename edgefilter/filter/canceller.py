@@ -214,7 +214,8 @@ class Canceller:
         self._noise *= memory
         self._noise += (1.0 - memory) * fourier.power(error_spectrum)
         self._hops += 1
-        heard = located and reference.dot(reference) > FLOOR * self.hop
+        played = self._recent[0, self.hop :]  # the reference, or nothing where it has just begun anew
+        heard = located and played.dot(played) > FLOOR * self.hop
         if heard and self._unknown:
             self._unknown -= 1
             self._expect_what_is_heard()

@@ -93,6 +93,17 @@ def test_a_filter_that_was_resumed_recovers_after_a_divergence(taught_s: float) 
         assert db(error[10_000:16_000]) < db(mic[at + 10_000 : at + 16_000]) - 30
 
 
+def test_a_filter_without_a_path_that_has_diverged_learns_as_a_new_one_does() -> None:
+    """The hop in which it begins anew has no reference left to tell the path's power by: 1e12 of it was expected."""
+    h, x = path(), speechlike(8.0)
+    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    canceller = Canceller(HOP, 3200)
+    x[16_000] = 1e12
+    error = run(canceller, mic, x)
+    assert canceller.stats()["diverged"] and canceller.state().covariance.max() < 100.0
+    assert db(error[-32_000:]) < db(mic[-32_000:]) - 20
+
+
 def test_a_filter_that_was_resumed_is_as_sure_of_its_path_as_one_that_was_not() -> None:
     h, x = path(), speechlike(4.0)
     mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
