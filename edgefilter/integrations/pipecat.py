@@ -9,10 +9,12 @@ Needs `pip install '.[pipecat]'` in a checkout.
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 from pipecat.audio.filters.base_audio_filter import BaseAudioFilter
 from pipecat.audio.vad.vad_analyzer import VADAnalyzer, VADParams
 from pipecat.frames.frames import (
@@ -30,6 +32,8 @@ from edgefilter.integrations.channels import named
 from edgefilter.integrations.duplex import Duplex, as_pcm16, from_pcm16
 from edgefilter.integrations.turns import TurnByTurn
 from edgefilter.types import SAMPLE_RATE, Event
+
+_LOGGER = logging.getLogger(__name__)
 
 
 class EgoFilters:
@@ -109,8 +113,24 @@ class _Microphone(_Filter):
 
 class _Loudspeaker(_Filter):
     async def filter(self, audio: bytes) -> bytes:
+        if self._channels == 1 and in_pairs(audio):
+            self._channels = 2
+            _LOGGER.warning(
+                "the loudspeaker has two equal channels, not one as was said: give EgoFilters out_channels=2"
+            )
         self._duplex.play_pcm16(audio, self._rate, self._channels)
         return audio
+
+
+def in_pairs(pcm: bytes) -> bool:
+    """Whether 16-bit sound has each sample twice, as one voice on two channels has: taken for one, it would last twice as long.
+
+    >>> in_pairs(np.repeat(np.arange(160, dtype="<i2"), 2).tobytes()), in_pairs(np.arange(320, dtype="<i2").tobytes())
+    (True, False)
+    """
+    samples = np.frombuffer(pcm, "<i2")
+    pairs = samples[: samples.size // 2 * 2].reshape(-1, 2)
+    return len(np.unique(samples)) > len(pairs) // 4 and bool((pairs[:, 0] == pairs[:, 1]).all())
 
 
 class _HumanVAD(VADAnalyzer):

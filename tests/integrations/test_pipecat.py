@@ -59,6 +59,20 @@ def test_the_loudspeaker_s_sound_is_left_alone_and_noted_at_its_rate(filters):
     assert filters.duplex.queued_s == pytest.approx(3200 / 24_000, abs=1e-3)
 
 
+def test_a_stereo_loudspeaker_that_nobody_told_of_is_noticed(caplog):
+    """Taken for one channel the reference would last twice as long as the speech: -2 dB instead of -27, without a word."""
+    ears = EgoFilters(EgoFilter(engine="linear"))
+
+    async def speak():
+        for part in np.split(NOISE, 10):
+            await ears.params["audio_out_filter"].filter(as_pcm16(part, 2))
+
+    asyncio.run(speak())
+    ears.duplex.end()
+    assert ears.duplex.queued_s == pytest.approx(3200 / 16_000, abs=1e-3)
+    assert [record.levelname for record in caplog.records] == ["WARNING"] and "out_channels=2" in caplog.text
+
+
 def test_a_stereo_microphone_stays_stereo(filters):
     async def hear():
         await filters.params["audio_in_filter"].start(16_000)
