@@ -10,6 +10,7 @@ training   what chooses a network: words on validation speakers, the scale of th
 serve      streams that a core serves in real time
 fuzz       damaged profiles, models and recordings
 mutate     whether the tests notice a change in the code
+count      lines, and numbers that have a name, by folder
 stale      which results are of another behaviour than today's; exit 1 if there are any
 tables     write the tables of README.md and bench/README.md anew from the results
 """

@@ -105,7 +105,9 @@ def per_device(rows: Sequence[dict], key: str) -> list[dict]:
 
 def overview(name: str, title: str, rows: Sequence[dict], here: Sequence[System]) -> dict:
     """A row a system: means over devices, the worst device, and paired differences from `crnn` without learning."""
-    devices = len({row["room"] for row in rows})
+    devices, with_human = (
+        len({row["room"] for row in part}) for part in (rows, [r for r in rows if r["set"] == "laid"])
+    )
     columns = ["system", ("SI-SDR, dB", 1), ("worst device", 1), ("words wrong, %", 0), ("robot alone, dB", 1),
                ("worst device", 1), "false starts", f"noticed in {SOON_S} s", ("dB less crnn", 1), ("words less crnn", 0)]  # fmt: skip
     cells = []
@@ -117,7 +119,7 @@ def overview(name: str, title: str, rows: Sequence[dict], here: Sequence[System]
         cells.append([one.title, mean(ratio, "si_sdr"), min((row["si_sdr"] for row in ratio), default=None),
                       mean(per_device(laid, "capped"), "capped"), mean(lowered, "erle_db"),
                       min((row["erle_db"] for row in lowered), default=None), starts(alone), soon(laid), *less])  # fmt: skip
-    return results.table(name, f"{title}: {devices}", columns, cells if devices else [])
+    return results.table(name, f"{title}: {devices}, a human laid on {with_human}", columns, cells if devices else [])
 
 
 def starts(alone: Sequence[dict]) -> str | None:

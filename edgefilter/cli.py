@@ -181,7 +181,7 @@ def _diagnose(commands: argparse._SubParsersAction) -> None:
     option("--channel", type=channel, metavar="N", help=told)
     told = "leave out what makes the running filter worse on seconds that no fit has used; takes a little longer"
     option("--prove", action="store_true", help=told)
-    rate = number(1e-6, 0.5, "a share from 0.000001 to 0.5, such as 0.01 for 1 in 100")
+    rate = number(1e-6, 0.5, "a share from 0.000001 to 0.5, such as 0.01 for 1 in 100", closed=True)
     told = "share of ordinary recordings in which an effect may be named by chance (default: %(default)g)"
     option("--false-rate", type=rate, default=Criteria.false_rate, metavar="P", help=told)
     option("--force", **FORCE)

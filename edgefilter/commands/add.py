@@ -105,7 +105,8 @@ class Fitted:
         if self.promised_db is not None and after_db > self.promised_db + PROMISE_DB:
             missing = f"{joined(self.dropped)} is not in it" if self.dropped else "no fit to all of it explains as much"
             lines.append(f"NOTE        what is written leaves more than the diagnosis did: {missing}")
-        if self.names and round(after_db, 1) >= round(before_db, 1):  # as they are shown
+        shown = round(before_db, 1), round(after_db, 1)  # a fan that is softer than it was has less than none
+        if self.names and shown[1] >= shown[0] and abs(shown[1]) >= abs(shown[0]):
             what = "this effect does" if len(self.names) == 1 else "these effects do"
             lines.append(f"WARNING     the error did not fall: {what} not explain the recording")
         return lines

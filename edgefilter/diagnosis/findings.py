@@ -94,7 +94,8 @@ def _intervals(prepared: Prepared, model: EchoModel, step: Trial) -> tuple[Mappi
         if len(fits) < 2:
             low, high = np.full_like(value, parameter.low), np.full_like(value, parameter.high)
         else:
-            low, high = _spread(value, [np.asarray(fit[parameter.name], float) for fit in fits])
+            spread = _spread(value, [np.asarray(fit[parameter.name], float) for fit in fits])
+            low, high = np.clip(spread, parameter.low, parameter.high)
         found[parameter.name] = Interval.of(value, low, high, parameter.unit)
     return found, failed
 

@@ -100,6 +100,7 @@ def _stepwise(bench: Workbench, start: EchoModel, first: Trial, known: set[froze
     model = split(bench, start, first.model)
     known.add(frozenset(added(start, model)))
     while len(added(start, model)) < bench.criteria.most_effects and not bench.explained(model):
+        bench.so_far(model)
         newest = forward(bench, model, most)
         if newest is None or (held := frozenset(added(start, newest.model))) in known:
             break

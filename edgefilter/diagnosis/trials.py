@@ -105,7 +105,7 @@ class Workbench:
         self._failed: dict[str, str] = {}
         self._spared: set[str] = set()
         self._in_vain: dict[str, float] = {}
-        self._refused = False
+        self._refused, self._so_far = False, ""
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -114,6 +114,11 @@ class Workbench:
             f"the search was stopped after fits of {self._cost / 10:.0f} s: something further may be in the recording"
         )
         return (*self._failed.values(), *((spent,) if self._refused else ()))
+
+    def so_far(self, model: EchoModel) -> None:
+        """Tell with what is tried next what a model has beyond the start, and what it leaves."""
+        if names := added(self._start, model):
+            self._so_far = f"; so far {' and '.join(names)}: {self.score(model).excess_db:.1f} dB left"
 
     def score(self, model: EchoModel) -> Score:
         """The score of a model, worked out once."""
@@ -176,7 +181,7 @@ class Workbench:
 
     def _attempt(self, name: str, model: EchoModel) -> Trial | None:
         if self._progress:
-            self._progress(f"trying {name}")
+            self._progress(f"trying {name}{self._so_far}")
         effect, others = find(name), model.without_effect(name)
         try:
             values = others.fitted(name, self.scorer.behind(others).measurement)
@@ -247,6 +252,8 @@ class Workbench:
         """The bar that a trial on a model does not reach, in words; empty where it is admissible."""
         if trial.p_value > self.criteria.false_rate:
             return f"{percent(trial.p_value)} of ordinary recordings show as much of some effect"
+        if trial.name in dict(self._start.effects):  # known to be there: it may be weaker now, or gone
+            return ""
         evidence = Evidence(trial.values, model, self.scorer, self.score(model), trial.score)
         return "" if find(trial.name).plausible(evidence) else "its values do not look like it"
 
@@ -275,8 +282,12 @@ class Workbench:
         return not (by_chance or taken_up)
 
     def absent(self, model: EchoModel, most: int) -> list[str]:
-        """Names of the effects that a model has not, or as the start has them, that may be tried and whose complexity is at most `most`."""
-        out = {*added(self._start, model), *self._without}
+        """Names of the effects that a model has not, or as the start has them, that may be tried and whose complexity is at most `most`.
+
+        Those that the start has at neutral values are in its path (Effect.absorbed): no search claims them.
+        """
+        taken_up = {name for name, values in self._start.effects if vanishes(find(name), values)}
+        out = {*added(self._start, model), *self._without, *taken_up}
         return [name for name in names() if name not in out and find(name).complexity <= most]
 
     def less(self, model: EchoModel, name: str) -> EchoModel:

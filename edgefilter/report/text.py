@@ -63,7 +63,7 @@ def headline(verdict: str, effects: Iterable[str], calibrated: bool = True) -> s
     if verdict == "explained" and not calibrated:
         return "A stationary linear path explains this recording. Only a calibration can tell which effects this path contains."
     if verdict == "missing":
-        return f"The profile lacks {found}."
+        return f"The recording differs from the profile by {found}."
     if verdict == "explained":
         return "The profile explains this recording."
     beside = f" beside {found}" if found else ""

@@ -91,6 +91,23 @@ def test_add_says_so_where_the_error_does_not_fall(scene, tmp_path, capsys):
     assert "the error did not fall" in capsys.readouterr().out
 
 
+def test_a_fan_that_is_softer_than_the_profile_has_it_is_a_smaller_error(scene, tmp_path, capsys):
+    """-6 dB before and 0 after is no error that did not fall; both ends of the range of --false-rate are in it."""
+    louder = Profile.load(scene / "robot.npz")
+    louder = louder.with_echo(
+        louder.echo.with_effect("fan_noise", {"spectrum_db": np.full(601, 6.0), "change_db": 6.0})
+    )
+    louder.save(scene / "fan.npz")
+    x, _ = soundfile.read(scene / "ref.wav", dtype="float32")
+    soundfile.write(scene / "softer.wav", record(x), RATE, "FLOAT")
+    words = arguments(scene, "diagnose", "--apply", tmp_path / "now.npz", profile="fan.npz", mic="softer.wav")
+    for rate in ("0.000001", "0.5"):
+        assert main([*words, "--false-rate", rate]) == 0
+        out = capsys.readouterr().out
+        assert "fan noise" in out and "did not fall" not in out
+    assert Profile.load(tmp_path / "now.npz").echo.effects
+
+
 @pytest.mark.slow
 def test_add_says_what_the_running_filter_makes_of_an_effect_where_that_is_nothing(scene, tmp_path, capsys):
     command = arguments(scene, "add clock_drift", "--output", tmp_path / "drift.npz", "--json")
@@ -120,7 +137,7 @@ def test_diagnose_finds_what_is_missing_and_writes_the_documented_json(scene, ca
     assert set(found["where"]) == {"bands", "times", "levels", "lags"}
     assert main(arguments(scene, "diagnose")) == 0
     out = capsys.readouterr().out
-    assert "verdict     missing: The profile lacks a turned volume." in out
+    assert "verdict     missing: The recording differs from the profile by a turned volume." in out
     assert "next        edgefilter add playback_gain --profile " in out
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from edgefilter.calibration.from_recording import self_calibrate
 from edgefilter.diagnosis import proven
 from edgefilter.diagnosis.compare import compare
 from edgefilter.diagnosis.diagnose import add, diagnose
@@ -14,6 +15,8 @@ from edgefilter.diagnosis.joint import fit_jointly, fit_straight
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.proof import HeldOut, Proof, prove
 from edgefilter.diagnosis.proven import diagnose_proven
+from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.measurement import Values
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import SignalError, UsageError
 from tests.diagnosis.robot_scene import FAN, path, profile, record, voice
@@ -205,6 +208,15 @@ def test_too_little_of_the_robot_cannot_be_held_out() -> None:
         prove(profile(), "playback_gain", record(x), x)
 
 
+def test_what_is_fitted_for_the_proof_of_a_compressor_has_not_heard_the_loud_end() -> None:
+    """Fitted to the loudest 8 s, of which nothing lay ahead of the cut, it was found neutral: as good before as after."""
+    x = voice(24.0)
+    x[: 15 * 16_000] *= 0.5
+    values = {"threshold_db": -40.0, "ratio": 4.0, "attack_ms": 5.0, "release_ms": 150.0}
+    proof = prove(profile(), "compression", record(x, EchoModel(path()).with_effect("compression", values)), x)
+    assert proof.erle_after_db > proof.erle_before_db + 3.0
+
+
 def test_an_unknown_name_among_several_is_refused(drifting) -> None:
     y, x = drifting
     with pytest.raises(UsageError, match="unknown effect 'late_reverbs'"):
@@ -242,6 +254,33 @@ def test_an_effect_that_the_profile_holds_is_named_where_its_values_are_others_b
     assert finding.evidence.endswith("the profile holds this effect with other values")
     for parameter, value in now.items():
         assert finding.parameters[parameter].value == pytest.approx(value, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("name", "before"),
+    [
+        ("clock_drift", {"ppm": 60.0, "offset": 0.0}),
+        ("bandlimit", {"cutoff_hz": 3000.0, "order": 12.0}),
+        (
+            "late_reverb",
+            {"taps": 0.05 * np.random.default_rng(2).standard_normal(6000) * np.exp(-np.arange(6000) / 1500)},
+        ),
+    ],
+)
+def test_an_effect_that_the_profile_holds_and_that_is_gone_is_named(name: str, before: Values) -> None:
+    """A clock that was changed, a robot that is back in its room: the new values alone do not look like the effect."""
+    x = voice(8.0)
+    knowing = profile().with_echo(profile().echo.with_effect(name, before))
+    diagnosis = diagnose(knowing, record(x), x)
+    assert diagnosis.verdict == "missing" and [finding.effect for finding in diagnosis.ranking] == [name]
+    assert diagnosis.comparison.excess_db > 15.0 and diagnosis.remaining_db < 3.0
+
+
+def test_what_a_path_that_the_recording_has_taught_contains_is_not_claimed() -> None:
+    x = voice(6.0)
+    y = record(x, office())
+    named = {finding.effect for finding in diagnose(self_calibrate(y, x), y, x).ranking}
+    assert not any(find(name).absorbed for name in named)
 
 
 def test_a_fan_that_the_profile_holds_is_named_by_what_it_is_over_the_calibrated_one() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import warnings
 from dataclasses import replace
 
@@ -148,6 +149,14 @@ def test_a_fit_that_fails_is_a_note_in_the_diagnosis_and_no_python_warning(fragi
         for text in found.to_dict()["warnings"]
         if "fragile could not be fitted" in text and "Singular matrix" in text
     ]
+
+
+def test_a_search_says_what_it_has_found_so_far() -> None:
+    x, said = voice(8.0), []
+    clipped = np.clip(record(x, EchoModel(path(seed=2))), -0.06, 0.06)
+    diagnose(profile(), clipped, x, progress=said.append)
+    assert said[0].startswith("trying") and "so far" not in said[0]
+    assert any(re.fullmatch(r"trying \w+; so far [\w ]+: -?\d+\.\d dB left", text) for text in said)
 
 
 def test_a_search_that_is_cut_short_says_so() -> None:

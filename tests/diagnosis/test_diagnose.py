@@ -18,6 +18,7 @@ from edgefilter.diagnosis.select import search
 from edgefilter.diagnosis.trials import Found, Trial, Workbench
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.effects.bandlimit import band_edge
+from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.evidence import Score
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.wiener import spectra
@@ -71,7 +72,11 @@ def test_one_hidden_effect_is_named_alone_and_leaves_nothing(effect: str, change
     assert (found.verdict, names(found)) == ("missing", [effect])
     assert found.remaining_db < 1.0  # the product's promise for linear effects and clipping
     assert found.ranking[0].share > 0.6
-    intervals = found.ranking[0].parameters.values()
+    intervals, bounds = found.ranking[0].parameters.values(), {p.name: p for p in find(effect).parameters}
+    for name, interval in found.ranking[0].parameters.items():
+        assert np.all(np.asarray(interval.low) >= bounds[name].low) and np.all(
+            np.asarray(interval.high) <= bounds[name].high
+        )
     assert any(np.any(np.asarray(interval.high) > np.asarray(interval.low)) for interval in intervals)
     for interval in intervals:
         assert np.all(np.asarray(interval.low) <= np.asarray(interval.value)) and np.all(

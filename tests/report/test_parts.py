@@ -51,7 +51,7 @@ def test_parameters_read_as_people_write_them(interval, said):
 def test_sentences_for_the_three_verdicts():
     assert (
         text.headline("missing", ["late_reverb", "clock_drift"])
-        == "The profile lacks late reverberation and clock drift."
+        == "The recording differs from the profile by late reverberation and clock drift."
     )
     assert text.headline("explained", []) == "The profile explains this recording."
     assert "no known effect explains." in text.headline("unexplained", [])
@@ -69,7 +69,7 @@ def test_the_terminal_says_verdict_budget_parameters_and_what_is_left():
     two = (finding("late_reverb", {"rt60_s": 0.61}), finding("my_own", {"depth": 2.0}, 1.0, 0.3))
     lines = diagnosis_lines(Diagnosis("missing", found, two, "A hum at 50 Hz.", 0.3, 0.1, profile().echo))
     told = "\n".join(lines)
-    assert lines[0] == "verdict     missing: The profile lacks late reverberation and my own."
+    assert lines[0] == "verdict     missing: The recording differs from the profile by late reverberation and my own."
     for part in (
         "with late_reverb",
         "rt60_s = 0.610 dB (0.510 to 0.710)",

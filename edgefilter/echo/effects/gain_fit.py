@@ -128,10 +128,14 @@ class GainFit:
 
 
 def excerpt(measurement: Measurement, model: VoiceModel, size: int) -> slice:
-    """The loudest stretch of so many samples of the reference, or the first one where the model knows what time it is."""
+    """The loudest stretch of so many samples of the reference, or the first one where the model knows what time it is.
+
+    Of those of which about as much may be fitted to as of any.
+    """
     x = measurement.reference
     if model.timed or x.size <= size:
         return slice(0, size)
-    energy = np.concatenate(([0.0], np.cumsum(x.astype(np.float64) ** 2)))
-    start = int(np.argmax(energy[size:] - energy[:-size]))
+    sums = (np.cumsum(np.pad(each, (1, 0)), dtype=np.float64) for each in (np.square(x), measurement.weights > 0.0))
+    energy, fitted = (total[size:] - total[:-size] for total in sums)
+    start = int(np.argmax(np.where(2.0 * fitted >= fitted.max(), energy, -1.0)))
     return slice(start, start + size)
