@@ -11,6 +11,7 @@ from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.result import Finding, Interval
 from edgefilter.diagnosis.score import Scorer, share_of
 from edgefilter.diagnosis.trials import Found, Trial, less
+from edgefilter.echo.effect import vanishes
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.measurement import Values
 from edgefilter.echo.model import EchoModel
@@ -65,8 +66,11 @@ def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[t
 
 def evidence_of(name: str, values: Values, start: EchoModel, otherwise: str) -> str:
     """What an effect says of its values, or otherwise; and that the start has it already, where it has."""
+    held = name in dict(start.effects)
+    if held and vanishes(find(name), values):
+        return "the recording shows nothing of it, and the profile holds it"
     said = find(name).sentence(values) or otherwise.removesuffix(HELD)
-    return said + (HELD if name in dict(start.effects) else "")
+    return said + (HELD if held else "")
 
 
 def _intervals(prepared: Prepared, model: EchoModel, step: Trial) -> tuple[Mapping[str, Interval], list[str]]:

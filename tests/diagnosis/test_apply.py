@@ -273,6 +273,8 @@ def test_an_effect_that_the_profile_holds_and_that_is_gone_is_named(name: str, b
     knowing = profile().with_echo(profile().echo.with_effect(name, before))
     diagnosis = diagnose(knowing, record(x), x)
     assert diagnosis.verdict == "missing" and [finding.effect for finding in diagnosis.ranking] == [name]
+    told = "nothing of it" if name == "late_reverb" else "with other values"
+    assert told in diagnosis.ranking[0].evidence
     assert diagnosis.comparison.excess_db > 15.0 and diagnosis.remaining_db < 3.0
 
 
