@@ -22,6 +22,8 @@ WRITTEN = (
     *("plot", "log_json"),
 )
 """Options that may name a file to write."""
+PROFILES = ("output", "save_profile", "learn", "apply")
+"""Those of them that name a profile: wherever 'output' is a file that is written in the end, it is one."""
 CASES = ("one", "two")
 """The robots of `demo --hidden`, folders of demo_data/hidden: one thing has happened to the first, two to the second."""
 HIDDEN_FILES = (
@@ -49,13 +51,15 @@ PACKAGE = Path(__file__).parent.parent
 class Place:
     """A file that an option names, or standard input or output (stream: its handle). role: how a message names it.
 
-    at_end: it is written when all the work is done, into a folder that has to exist.
+    at_end: it is written when all the work is done, into a folder that has to exist. replaced: it is
+    written under another name first, then renamed over what is there.
     """
 
     role: str
     path: str
     stream: int | None = None
     at_end: bool = False
+    replaced: bool = False
 
     def __str__(self) -> str:
         return f"{self.role} {self.path}"
@@ -142,7 +146,8 @@ def _written(args: argparse.Namespace) -> Iterator[Place]:
         if (args.command, option) not in FOLDERS:
             sound = (args.command, option) == ("run", "output")
             to_stdout = path == "-" and (sound or option in ("json", "log_json"))
-            yield Place(role, path, 1 if to_stdout else None, at_end=not sound and not to_stdout)
+            at_end = not sound and not to_stdout
+            yield Place(role, path, 1 if to_stdout else None, at_end, replaced=option in PROFILES)
 
 
 def question_of(excitation: str) -> str:
@@ -164,15 +169,17 @@ def _check_writable(place: Place) -> None:
     """Raise EdgefilterError where writing is bound to fail, so that it is said before minutes of work, not after."""
     folder = os.path.dirname(os.path.realpath(place.path))
     if os.path.isdir(place.path):
-        why = errno.EISDIR
+        why = os.strerror(errno.EISDIR)
     elif not os.path.isdir(folder):
-        why = errno.ENOTDIR if os.path.exists(folder) else errno.ENOENT
+        why = os.strerror(errno.ENOTDIR if os.path.exists(folder) else errno.ENOENT)
     elif not os.access(place.path if os.path.exists(place.path) else folder, os.W_OK):
-        why = errno.EACCES
+        why = os.strerror(errno.EACCES)
+    elif place.replaced and _device(place):
+        why = "a file cannot replace it"
     else:
         return
     raise EdgefilterError(
-        f"{place} cannot be written: {os.strerror(why)}; name a file in a folder that exists and can be written to"
+        f"{place} cannot be written: {why}; name a file in a folder that exists and can be written to"
     )
 
 

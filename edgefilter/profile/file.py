@@ -126,8 +126,9 @@ def _replace(path: Path, members: Mapping[str, Any]) -> None:
 def read_fields(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any], Effects]:
     """(arrays, header, effects) of a file that write_fields wrote; ProfileError, in one line, for any other."""
     try:
-        if path.is_dir():
-            raise ProfileError(f"{path}: is a folder, expected a profile file; {REMEDY}")
+        if path.exists() and not path.is_file():  # a pipe would be waited for, without end
+            found = "a folder" if path.is_dir() else "no regular file"
+            raise ProfileError(f"{path}: is {found}, expected a profile file; {REMEDY}")
         if path.stat().st_size > MAX_FILE_BYTES:
             raise ProfileError(f"{path}: {path.stat().st_size} bytes long, expected at most {MAX_FILE_BYTES}; {REMEDY}")
         return _decode(_members(path.read_bytes()))

@@ -249,6 +249,25 @@ def test_a_result_that_could_not_be_written_in_the_end_is_said_before_the_work(h
     assert content(heard.parent) == before
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["run", "--input", "heard/mic.wav", "--output", "o.wav", "--save-profile", "pipe"],
+        ["run", "--input", "heard/mic.wav", "--output", "o.wav", "--learn", "pipe"],
+        ["diagnose", "--recording", "heard/mic.wav", "--reference", "heard/reference.wav", "--apply", "pipe"],
+        ["remove", "rattle", "--profile", "heard/robot.npz", "--output", "pipe"],
+    ],
+)
+def test_a_profile_cannot_replace_a_pipe_which_is_said_before_the_work(heard, capsys, monkeypatch, words):
+    monkeypatch.chdir(heard.parent)
+    os.mkfifo("pipe")
+    before = content(heard.parent)
+    assert main(words) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "pipe cannot be written: a file cannot replace it" in line
+    assert content(heard.parent) == before and Path("pipe").is_fifo()
+
+
 def test_a_dash_where_no_stream_is_meant_is_refused(heard, capsys):
     refused(
         heard, capsys, run(heard, "--output", "o.wav", "--save-profile", "-"), "--save-profile -", "standard output"

@@ -228,6 +228,11 @@ def test_a_piece_cut_out_or_doubled_is_one_line(saved):
                 refused(saved, "truncated or damaged|no .npy array|claims shape|holds")
 
 
+def test_a_named_pipe_in_place_of_a_profile_is_one_line_and_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    refused(tmp_path / "pipe", "is no regular file")
+
+
 def test_no_such_file_folder_and_other_types(tmp_path):
     refused(tmp_path / "absent.npz", "no such file")
     refused(tmp_path, "is a folder")
