@@ -7,7 +7,9 @@ import io
 import os
 import stat
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import soundfile
@@ -67,6 +69,21 @@ def make_folder(folder: Path, purpose: str) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise AudioFileError(f"folder {folder} for {purpose} cannot be made: {error.strerror}; name another") from None
+
+
+@contextmanager
+def whole(path: str | Path) -> Iterator[BinaryIO]:
+    """A file to write, of which no part is left where the writing fails or is interrupted; raises OSError."""
+    file = open(path, "wb")  # noqa: SIM115
+    try:
+        with file:
+            yield file
+    except BaseException:
+        written = Path(path).resolve()
+        if written.is_file():
+            with suppress(OSError):
+                written.unlink()
+        raise
 
 
 class FileSource(Source):
@@ -157,6 +174,7 @@ class Disk(io.RawIOBase):
 
     def __init__(self, path: Path) -> None:
         super().__init__()
+        self._path = path.resolve()
         # the file as it is: emptied only once it is known that nobody else writes it
         self._file = io.FileIO(path, "r+", opener=lambda name, flags: os.open(name, flags | os.O_CREAT, 0o666))
         if stat.S_ISREG(os.fstat(self._file.fileno()).st_mode):
@@ -204,10 +222,15 @@ class Disk(io.RawIOBase):
             self.error = self.error or error
         self._file.seek(at)
 
-    def finish(self) -> None:
-        """Close the file after its encoder; if the disk was full, or the sizes are too large for a header, it is put right."""
+    def finish(self, sound: bool = True) -> None:
+        """Close the file after its encoder; if the disk was full, or the sizes are too large for a header, it is put right.
+
+        sound: whether any was written; a full disk, on which not even the header may have fitted, keeps no file without.
+        """
         try:
-            if self.error or self._file.seek(0, os.SEEK_END) > _MOST:
+            if self.error and not sound and self._path.is_file():
+                self._path.unlink()
+            elif self.error or self._file.seek(0, os.SEEK_END) > _MOST:
                 self._repair_header()
             self._file.close()
         except OSError as error:
@@ -293,8 +316,10 @@ class FileSink(Sink):
                 self._disk, "w", SAMPLE_RATE, channels, "FLOAT" if float32 else "PCM_16", format=form
             )
         except soundfile.LibsndfileError as error:
-            self._disk.finish()
+            self._disk.finish(sound=False)
             raise self._full(self._disk.error or OSError(errno.EIO, str(error))) from None
+        if self._disk.error:
+            self.close()
 
     def __exit__(self, *exc: object) -> None:
         self.close(quiet=exc[0] is not None)
@@ -323,7 +348,7 @@ class FileSink(Sink):
             self._file.close()
         finally:
             self._file = None
-            self._disk.finish()
+            self._disk.finish(self.written > 0)
         if self.clipped:
             self.notes.append(clip_note(self.clipped, self.written))
         if self._disk.error and not quiet:

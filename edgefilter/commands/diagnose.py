@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from edgefilter.audio.files import whole
 from edgefilter.commands.add import Fitted, Refused, fit
 from edgefilter.commands.display import print_result, progress, report_part
 from edgefilter.commands.recordings import load, load_array
@@ -111,7 +112,8 @@ def _written(args: argparse.Namespace, found: Diagnosis) -> list[str]:
         return [f"no law explains much more than what is named: {args.write_effect} is not written"]
     path = Path(args.write_effect)
     try:
-        path.write_text(found.law.file(path.stem), encoding="utf-8")
+        with whole(path) as file:
+            file.write(found.law.file(path.stem).encode())
     except OSError as error:
         raise EdgefilterError(
             f"{path} cannot be written ({error.strerror}); name a file in a folder that exists"

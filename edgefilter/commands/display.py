@@ -13,10 +13,10 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
+from edgefilter.audio.files import whole
 from edgefilter.errors import AudioFileError, UsageError
 from edgefilter.types import SAMPLE_RATE, SET_UP_WRONG, Event, Stats
 
@@ -218,7 +218,8 @@ def write_json(data: object, path: str) -> None:
         print(text)
         return
     try:
-        Path(path).write_text(text + "\n")
+        with whole(path) as file:
+            file.write(f"{text}\n".encode())
     except OSError as error:
         raise AudioFileError(
             f"cannot write {path}: {error.strerror}: choose a folder that exists and can be written"

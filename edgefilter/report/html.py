@@ -13,6 +13,7 @@ from typing import Any
 import jinja2
 import numpy as np
 
+from edgefilter.audio.files import whole
 from edgefilter.diagnosis.closer_look import CloserLook
 from edgefilter.diagnosis.compare import Comparison, describe
 from edgefilter.diagnosis.diagnose import Diagnosis, Finding
@@ -119,7 +120,8 @@ def passport_page(found: Passport, diagnosis: str, names: Mapping[str, Any]) -> 
 def write_page(path: str | Path, page: str) -> None:
     """Write the page; raises EdgefilterError where it cannot be written."""
     try:
-        Path(path).write_text(page, encoding="utf-8", errors="backslashreplace")
+        with whole(path) as file:
+            file.write(page.encode(errors="backslashreplace"))
     except OSError as error:
         raise EdgefilterError(
             f"{path}: the report cannot be written ({error.strerror}); name a .html file in a folder that exists"

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
+from edgefilter.audio.files import whole
 from edgefilter.dsp.frames import decibels
 from edgefilter.errors import EdgefilterError
 from edgefilter.profile.approximation import LinearApproximation
@@ -135,7 +136,8 @@ def _figure(width: float, height: float) -> Figure:
 
 def _save(figure: Figure, path: str | Path) -> None:
     try:
-        figure.savefig(path)
+        with whole(path) as file:
+            figure.savefig(file, format=Path(path).suffix[1:])
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
         raise EdgefilterError(

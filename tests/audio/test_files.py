@@ -13,8 +13,11 @@ import pytest
 import soundfile
 
 from edgefilter.audio import files
-from edgefilter.audio.files import Disk, FileSink, FileSource, Recorder, open_source
-from edgefilter.errors import AudioFileError, UsageError
+from edgefilter.audio.files import Disk, FileSink, FileSource, Recorder, open_source, whole
+from edgefilter.commands.display import write_json
+from edgefilter.errors import AudioFileError, EdgefilterError, UsageError
+from edgefilter.report.html import write_page
+from edgefilter.report.plots import plot_before_after
 from edgefilter.types import ALL_CHANNELS, Block
 
 ROOT = Path(__file__).parents[2]
@@ -210,6 +213,53 @@ def test_what_fitted_on_a_full_disk_stays_a_valid_file(tmp_path, suffix):
     kept, _ = read(FileSource(path))
     assert kept.size > 45000  # nearly what 100001 bytes hold, less the write that failed
     np.testing.assert_array_equal(kept, noise(160000)[: kept.size])
+
+
+@pytest.fixture
+def small_disk():
+    """No file of this process may be longer than so many bytes, which fails a write as a full disk does."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    signal.signal(signal.SIGXFSZ, handler)
+
+
+@pytest.mark.parametrize("suffix", [".wav", ".flac"])
+def test_a_disk_on_which_not_even_the_header_fits_keeps_no_empty_file(tmp_path, small_disk, suffix):
+    small_disk(10)
+    with pytest.raises(AudioFileError, match="File too large"), FileSink(tmp_path / f"x{suffix}") as sink:
+        sink.write(noise(16000))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_record_for_which_a_full_disk_has_no_room_leaves_no_empty_file(tmp_path, small_disk):
+    small_disk(10)
+    with pytest.raises(AudioFileError, match="mic.wav cannot be written on: File too large"):
+        Recorder(tmp_path, 1)
+    assert not list(tmp_path.iterdir())
+
+
+def test_figures_pages_and_pictures_that_do_not_fit_on_a_disk_leave_no_part_behind(tmp_path, small_disk):
+    small_disk(1000)
+    text = 1000 * "too long "
+    for write, name in (
+        (lambda path: write_json({"text": text}, str(path)), "figures.json"),
+        (lambda path: write_page(path, text), "page.html"),
+        (lambda path: plot_before_after({"sound": noise(16000)}, path), "picture.png"),
+    ):
+        with pytest.raises(EdgefilterError, match="File too large"):
+            write(tmp_path / name)
+        assert not list(tmp_path.iterdir()), name
+
+
+def test_an_interrupt_while_a_file_is_written_leaves_no_part_behind_nor_harms_a_device(tmp_path):
+    (tmp_path / "null").symlink_to(os.devnull)
+    for name in ("page.html", "null"):
+        with pytest.raises(KeyboardInterrupt), whole(tmp_path / name) as file:
+            file.write(b"the beginning")
+            raise KeyboardInterrupt
+    assert os.path.exists(os.devnull) and [path.name for path in tmp_path.iterdir()] == ["null"]
 
 
 def test_recorder_keeps_the_exact_blocks(tmp_path):
