@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 from edgefilter import __version__
 from edgefilter.commands.display import STATUS_LEGEND
 from edgefilter.commands.outputs import check_outputs
+from edgefilter.commands.signals import on_signal
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.echo.effects.catalogue import names
 from edgefilter.echo.user_effects import load_effect
@@ -420,8 +421,9 @@ def main(argv: list[str] | None = None) -> int:
         # a pipe gets each line at once; a file name that the terminal's encoding lacks is no reason to stop
         sys.stdout.reconfigure(line_buffering=True, errors="backslashreplace")
     try:
-        code = _call(arguments)
-        sys.stdout.flush()  # what is still buffered fails here, with a reason, or at exit, with a traceback
+        with on_signal(_interrupt):
+            code = _call(arguments)
+            sys.stdout.flush()  # what is still buffered fails here, with a reason, or at exit, with a traceback
         return code
     except UsageError as error:
         return _fail(error, 2, debug)
@@ -448,6 +450,11 @@ def _call(arguments: list[str]) -> int:
     for file in getattr(args, "effects", []):
         load_effect(file)
     return importlib.import_module(f"edgefilter.commands.{args.command}").main(args) or 0
+
+
+def _interrupt() -> NoReturn:
+    """SIGTERM ends a command as Ctrl-C does; `run` and those that serve have an answer of their own."""
+    raise KeyboardInterrupt
 
 
 def _forget_output() -> None:

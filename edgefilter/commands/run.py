@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 import gc
 import math
-import signal
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -22,6 +20,7 @@ from edgefilter.audio.reader import Reader
 from edgefilter.audio.steady import SteadySink
 from edgefilter.commands.display import describe_latency, say, write_json
 from edgefilter.commands.observers import Observers, observing
+from edgefilter.commands.signals import on_signal
 from edgefilter.engines import HAVE_LINEAR_STAGE
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
 from edgefilter.filter.budget import DEFAULT_MS, Choice, allowed_cores, choose, forget
@@ -33,8 +32,6 @@ from edgefilter.session import RunReport, filter_blocks
 from edgefilter.types import ALL_CHANNELS, SAMPLE_RATE, Block
 
 FILE_ENDINGS = (".wav", ".flac", ".ogg", ".mp3", ".aiff", ".aif", ".w64", ".opus", ".txt", ".raw", ".pcm")
-TWICE_S = 0.5
-"""Seconds after which a second signal counts: timeout(1) signals a program and its group, which is one request."""
 
 
 def main(args: argparse.Namespace) -> int:
@@ -54,7 +51,8 @@ def main(args: argparse.Namespace) -> int:
         say(note)
     told = len(source.notes)
     observed = observing(args, ego, source, speech, notes)
-    with stop_on_signal(source) as stopped, source, sink, observed as observers, garbage_of_this_run_only():
+    # a later signal ends the run at once: nobody may be reading the pipe that the first waits for
+    with on_signal(source.stop) as stopped, source, sink, observed as observers, garbage_of_this_run_only():
         report = filter_blocks(
             limited(source, limit),
             ego,
@@ -276,28 +274,3 @@ def garbage_of_this_run_only() -> Iterator[None]:
         yield
     finally:
         gc.unfreeze()
-
-
-@contextmanager
-def stop_on_signal(source: Source) -> Iterator[list[int]]:
-    """SIGINT and SIGTERM end the source, and with it the run, in good order; the list then holds the signal.
-
-    A later one ends the run at once: nobody may be reading the pipe that the first waits for.
-    """
-    caught: list[int] = []
-    first_at = 0.0
-
-    def handle(number: int, _frame: object) -> None:
-        nonlocal first_at
-        if caught and time.monotonic() - first_at > TWICE_S:
-            raise KeyboardInterrupt
-        first_at = first_at or time.monotonic()
-        caught.append(number)
-        source.stop()
-
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield caught
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

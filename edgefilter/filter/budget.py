@@ -250,9 +250,10 @@ def keep(about: Mapping[str, object], figures: Mapping[str, Figures]) -> str | N
         draft.write_text(json.dumps(everything, indent=1) + "\n", encoding="utf-8")
         draft.replace(timings())
     except OSError as error:
-        with suppress(OSError):
-            draft.unlink()
         return f"{draft.parent}: {error.strerror}"
+    finally:
+        with suppress(OSError):
+            draft.unlink(missing_ok=True)
     return None
 
 

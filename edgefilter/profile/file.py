@@ -116,11 +116,12 @@ def _replace(path: Path, members: Mapping[str, Any]) -> None:
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
         raise ProfileError(
             f"{path}: the profile cannot be written ({error.strerror}); choose another place or free space"
         ) from None
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def read_fields(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any], Effects]:

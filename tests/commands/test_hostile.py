@@ -2,11 +2,13 @@
 
 import contextlib
 import fcntl
+import signal
 import subprocess
 import sys
 import termios
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +16,8 @@ import soundfile
 
 from tests.commands.program import here
 from tests.diagnosis.robot_scene import profile, record, voice
+
+DEMO = Path(__file__).parents[2] / "edgefilter/demo_data"
 
 
 def program(folder, *words, **options):
@@ -250,3 +254,31 @@ def test_a_second_signal_ends_a_run_whose_reader_does_not_read(folder):
     finally:
         child.kill()
         child.wait()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("command", ["diagnose", "passport", "demo", "doctor"])
+def test_a_signal_ends_each_command_with_one_line_also_where_it_comes_twice(tmp_path, command, number):
+    """timeout(1) signals a program and its group."""
+    robot = DEMO / "hidden/one"
+    alone = ("--recording", robot / "mic.flac", "--reference", robot / "reference.flac")
+    words = {"diagnose": alone, "passport": alone, "demo": ("--hidden", "--output", tmp_path), "doctor": ()}[command]
+    child = subprocess.Popen(
+        [sys.executable, "-u", "-m", "edgefilter.cli", command, *map(str, words)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    try:
+        child.stdout.readline()  # it has begun
+        child.send_signal(number)
+        child.send_signal(number)
+        said = child.communicate(timeout=20)[0].splitlines()
+    finally:
+        child.kill()
+        child.wait()
+    assert child.returncode == 130 and said[-1] == "edgefilter: interrupted", said
+    assert not [line for line in said if "Traceback" in line], said
+    for file in tmp_path.rglob("*.*"):
+        assert soundfile.info(file).frames if file.suffix == ".wav" else file.suffix == ".npz", file

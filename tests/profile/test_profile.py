@@ -384,6 +384,18 @@ def test_full_disk_leaves_the_old_file_and_no_rubbish(saved):
     assert saved.read_bytes() == before and os.listdir(saved.parent) == ["robot.npz"]
 
 
+def test_an_interrupt_while_a_profile_is_saved_leaves_the_old_file_and_no_rubbish(saved, monkeypatch):
+    before = saved.read_bytes()
+
+    def interrupt(file):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        make().save(saved)
+    assert saved.read_bytes() == before and os.listdir(saved.parent) == ["robot.npz"]
+
+
 def test_a_profile_is_on_the_disk_before_it_takes_the_place_of_the_old_one(saved, monkeypatch):
     """After a power cut the name must not stand for a file that was never written."""
     happened, fsync, replace = [], os.fsync, os.replace
