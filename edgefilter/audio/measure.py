@@ -24,6 +24,7 @@ def play_and_record(
     latency_s: float = STREAM_LATENCY_S,
     tell: Callable[[float], None] = lambda left_s: None,
     channels: Sequence[int] | None = None,
+    keep: Callable[[Samples], None] = lambda recorded: None,
 ) -> tuple[Samples, str]:
     """Play samples (n,) at 16 kHz and return what the microphone hears until a second after them, and what was lost, in words.
 
@@ -31,7 +32,8 @@ def play_and_record(
     constant: the devices' buffers appear as additional delay, so that the sound never seems to arrive before it is
     played. Silence goes first, since sound servers swallow a stream's start.
     latency_s: the buffers asked of the sound system; the larger, the fewer holes. tell: called again and again with the
-    seconds that are left. channels: numbers, from 0, of those that are wanted in place of their mean.
+    seconds that are left. channels: numbers, from 0, of those that are wanted in place of their mean. keep: called with
+    what was recorded, also where a device stops or an interrupt comes before its end, if it has begun.
     Raises DeviceError where a device cannot be opened or stops, UsageError for the virtual microphone, which hears nothing.
     """
     mic = input_port(microphone, latency_s, channels)
@@ -66,9 +68,13 @@ def play_and_record(
     finally:
         mic.close()
         speaker.close()
+        parts.append(mic.take())
+        recorded = np.concatenate(parts)[first : first + wanted]
+        if first and len(recorded):
+            keep(recorded)
     lost = {"samples lost": mic.inlet.lost, "overruns": mic.inlet.flags, "underruns": speaker.flags}
     holes = ", ".join(f"{count} {what}" for what, count in lost.items() if count)
-    return np.concatenate(parts)[first : first + wanted], holes
+    return recorded, holes
 
 
 def _holding(output: Named, samples: Samples, latency_s: float = STREAM_LATENCY_S) -> OutputPort:

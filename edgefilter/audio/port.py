@@ -148,8 +148,8 @@ class Port:
         self._progress = progress
         if self._still_s > patience_s:
             raise DeviceError(
-                f"{self._name} stopped (no sound for {patience_s:.0f} s: unplugged, or the sound server ended); what"
-                " came until then is kept: reconnect it and start again"
+                f"{self._name} stopped (no sound for {patience_s:.0f} s: unplugged, or the sound server ended): reconnect"
+                " it and start again"
             )
 
     def close(self, drain: bool = False) -> None:

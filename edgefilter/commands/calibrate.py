@@ -98,13 +98,16 @@ def _record(args: argparse.Namespace, folder: Path) -> tuple[Samples, Samples, S
 def take(args: argparse.Namespace, sound: Samples, what: str, file: Path | None = None) -> Samples:
     """Play on --speaker and record on --input, again with larger buffers where something was lost: the hole would be measured.
 
-    file: keeps each recording, also one with holes.
+    file: keeps each recording, also one with holes or without an end.
     """
+
+    def keep(recorded: Samples) -> None:
+        if file:
+            write_file(file, recorded, float32=True)
+
     for latency_s in BUFFERS_S:
         channels = getattr(args, "mic_channels", None)
-        found, holes = play_and_record(args.speaker, args.input, sound, latency_s, countdown(what), channels)
-        if file:
-            write_file(file, found, float32=True)
+        found, holes = play_and_record(args.speaker, args.input, sound, latency_s, countdown(what), channels, keep)
         if not holes:
             return found
         say(f"the recording has holes ({holes})")
