@@ -9,11 +9,12 @@ import math
 import os
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, NoReturn
 
 from edgefilter import __version__
-from edgefilter.commands.display import STATUS_LEGEND
+from edgefilter.commands.display import STATUS_LEGEND, own_words_only
 from edgefilter.commands.outputs import check_outputs
 from edgefilter.commands.signals import on_signal
 from edgefilter.diagnosis.criteria import Criteria
@@ -62,7 +63,9 @@ def build_parser() -> Parser:
     """All commands and their options."""
     parser = Parser(prog="edgefilter", description="Hear the human while the robot talks.")
     parser.add_argument("--version", action="version", version=f"edgefilter {__version__}")
-    parser.add_argument("--debug", action="store_true", help="show a traceback when something fails")
+    parser.add_argument(
+        "--debug", action="store_true", help="show a traceback when something fails, and what C libraries print"
+    )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     for add_command in (_demo, _run, _calibrate, _compare, _diagnose, _probe, _passport, _add, _remove):
         add_command(commands)
@@ -421,7 +424,7 @@ def main(argv: list[str] | None = None) -> int:
         # a pipe gets each line at once; a file name that the terminal's encoding lacks is no reason to stop
         sys.stdout.reconfigure(line_buffering=True, errors="backslashreplace")
     try:
-        with on_signal(_interrupt):
+        with on_signal(_interrupt), nullcontext() if debug else own_words_only():
             code = _call(arguments)
             sys.stdout.flush()  # what is still buffered fails here, with a reason, or at exit, with a traceback
         return code

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import ctypes
 import importlib
 import json
 import math
@@ -13,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import cache
 from types import ModuleType
 from typing import TYPE_CHECKING
 
@@ -54,6 +56,33 @@ def say(text: str) -> None:
     """
     with suppress(OSError):
         print(text, file=sys.stderr, flush=True)
+
+
+@contextmanager
+def own_words_only() -> Iterator[None]:
+    """Keep off the terminal what C libraries print by themselves, such as PortAudio's threads when a sound server ends.
+
+    They print to C's stderr, which in glibc is a variable; other C libraries' is left alone. Python's standard error,
+    and that of other programs, is the same file by another way.
+    """
+    if sys.platform != "linux" or not hasattr(c := ctypes.CDLL(None), "gnu_get_libc_version"):
+        yield
+        return
+    stream = ctypes.c_void_p.in_dll(c, "stderr")
+    before = stream.value
+    stream.value = _nowhere() or before
+    try:
+        yield
+    finally:
+        stream.value = before
+
+
+@cache
+def _nowhere() -> int | None:
+    """A stream of C's that ends in nothing; it is never closed, since a thread of a library may still hold it."""
+    c = ctypes.CDLL(None)
+    c.fopen.restype = ctypes.c_void_p
+    return c.fopen(os.devnull.encode(), b"w")
 
 
 def countdown(what: str) -> Callable[[float], None]:

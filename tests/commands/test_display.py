@@ -153,6 +153,20 @@ def test_piped_output_is_there_line_by_line_and_not_when_the_program_ends():
     assert done.stdout.endswith("last\n")
 
 
+def test_what_a_c_library_prints_is_kept_off_the_terminal_and_what_python_or_another_program_says_is_not():
+    code = (
+        "import ctypes, os, sys\n"
+        "from edgefilter.commands.display import own_words_only\n"
+        "c = ctypes.CDLL(None)\n"
+        "library = lambda word: c.fputs(word, ctypes.c_void_p.in_dll(c, 'stderr'))\n"
+        "with own_words_only():\n"
+        "    library(b'noise'); print('python', file=sys.stderr, flush=True); os.system('echo program >&2')\n"
+        "library(b'library')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, check=True)
+    assert done.stderr.split() == ["python", "program", "library"]
+
+
 def test_progress_goes_on_being_said_while_one_step_lasts(capsys, monkeypatch):
     monkeypatch.setattr(display, "LINE_PERIOD_S", 0.05)
     with display.progress("diagnosis") as step:

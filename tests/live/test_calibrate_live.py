@@ -2,9 +2,11 @@
 
 import json
 import subprocess
+import time
 
 import numpy as np
 import pytest
+import soundfile
 
 from edgefilter import Profile
 from tests.live.test_run_live import ROOT, edgefilter
@@ -72,3 +74,21 @@ def test_live_calibration_works_while_another_program_listens_to_the_monitor(ser
         listener.wait()
     assert figures["delay_samples"] > 0 and figures["distortion_db"]["2"] < -60
     assert not [line for line in said if "ALSA" in line or "Expression" in line], said
+
+
+def test_a_sound_server_that_ends_is_one_line_and_what_was_heard_until_then_is_kept(server, tmp_path):
+    subprocess.run(
+        ["pactl", "load-module", "module-loopback", "source=robot.monitor", "sink=robot_mic", "latency_msec=30"],
+        env=server.environment, check=True, capture_output=True,
+    )  # fmt: skip
+    calibration = calibrating(server, tmp_path, "--save-input", tmp_path / "kept")
+    for line in calibration.stderr:
+        if "now playing" in line:
+            break
+    time.sleep(3.0)
+    server.process.kill()
+    said = calibration.communicate(timeout=60)[1].splitlines()
+    assert calibration.returncode == 1 and len(said) == 2, said  # not a word of PortAudio's
+    assert said[0] == f"what was recorded is kept in {tmp_path / 'kept'}" and "the sound server ended" in said[1]
+    heard = soundfile.read(tmp_path / "kept/sweep_recording.wav")[0]
+    assert 1.5 < heard.size / 16000 < 4 and np.abs(heard[-4000:]).max() > 0.1  # into the sweep, which peaks at -12 dB
