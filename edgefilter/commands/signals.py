@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,9 +14,15 @@ TWICE_S = 0.5
 
 @contextmanager
 def on_signal(end: Callable[[], None]) -> Iterator[list[int]]:
-    """The first SIGINT or SIGTERM calls end; the list then holds it. A later one raises KeyboardInterrupt."""
+    """The first SIGINT or SIGTERM calls end; the list then holds it. A later one raises KeyboardInterrupt.
+
+    Python hands signals to the main thread alone: in another one nothing changes.
+    """
     caught: list[int] = []
     first_at = 0.0
+    if threading.current_thread() is not threading.main_thread():
+        yield caught
+        return
 
     def handle(number: int, _frame: object) -> None:
         nonlocal first_at

@@ -137,7 +137,7 @@ def _figure(width: float, height: float) -> Figure:
 def _save(figure: Figure, path: str | Path) -> None:
     try:
         with whole(path) as file:
-            figure.savefig(file, format=Path(path).suffix[1:])
+            figure.savefig(file, format=Path(path).suffix[1:] or "png")
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
         raise EdgefilterError(
