@@ -368,3 +368,9 @@ def test_a_reference_shorter_than_its_fades_is_searched_too(known):
     search.prepare(tape, 60_000, 60_000 - known)
     search.listen({0: tape}, 60_000, 60_000 - known)
     assert search.find() is None
+
+
+def test_before_anything_is_heard_nothing_is_known():
+    stats = Aligner(256).stats()
+    assert (stats["state"], stats["delay_samples"], stats["confidence"]) == ("idle", None, 0.0)
+    assert stats["utterances"] == stats["realignments"] == stats["jumps"] == 0

@@ -19,6 +19,7 @@ from edgefilter.echo.model import EchoModel
 from edgefilter.filter.budget import DEMO
 from tests.as_before import levels_db, same_as_before
 from tests.diagnosis.robot_scene import path, profile, record, voice
+from tests.diagnosis.test_laws import HIDDEN, lawful
 
 
 def read(folder: Path, name: str) -> np.ndarray:
@@ -100,6 +101,14 @@ def test_of_a_small_robot(what: str) -> None:
 def test_of_an_unknown_device(what: str) -> None:
     x = voice(10.0)
     same_as_before(f"passport_{what}", measure(HAPPENED[what](x), x, voice(2.0, seed=5), engines=["linear"]).to_dict())
+
+
+@pytest.mark.parametrize("family", HIDDEN)
+def test_of_a_free_law(family: str) -> None:
+    """Its lines of Python hold every number of it."""
+    law = lawful(family)
+    found = {"code": law.code, "words": law.words, "gain_db": law.gain_db, "curve": law.curve.to_dict()}
+    same_as_before(f"law_{family.replace(' ', '_')}", found, 0.02, 0.02)
 
 
 def interrupted(x: np.ndarray) -> np.ndarray:
