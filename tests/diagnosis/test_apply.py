@@ -278,6 +278,17 @@ def test_an_effect_that_the_profile_holds_and_that_is_gone_is_named(name: str, b
     assert diagnosis.comparison.excess_db > 15.0 and diagnosis.remaining_db < 3.0
 
 
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [("playback_gain", {"gain_db": -4.0}), ("clock_drift", DRIFT), ("compression", HELD["compression"][0])],
+)
+def test_a_room_that_the_profile_holds_does_not_take_up_what_else_happens(name: str, values: Values) -> None:
+    x = voice(10.0)
+    knowing = profile().with_echo(office())
+    diagnosis = diagnose(knowing, record(x, office().with_effect(name, values)), x)
+    assert (diagnosis.verdict, [finding.effect for finding in diagnosis.ranking]) == ("missing", [name])
+
+
 def test_what_a_path_that_the_recording_has_taught_contains_is_not_claimed() -> None:
     x = voice(6.0)
     y = record(x, office())
