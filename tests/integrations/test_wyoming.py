@@ -268,14 +268,16 @@ def test_a_microphone_that_sends_a_broken_chunk_is_opened_again(broken, player, 
 
 @pytest.mark.slow
 def test_the_loopback_of_the_device_is_the_reference_where_it_is_named(talking, player, tmp_path):
-    """As a command records it: three channels, the first of which is what is played."""
+    """As a command records it: three channels, the first of which is what is played. It is silent until somebody listens, and afterwards."""
     profile, sound = talking
     (tmp_path / "six.raw").write_bytes(np.rint(sound * 32768).astype("<i2").tobytes())
+    begin = tmp_path / "begin"
     code = (
-        f"import sys, time; data = open({str(tmp_path / 'six.raw')!r}, 'rb').read(); time.sleep(2)\n"
-        "for at in range(0, len(data), 1920): sys.stdout.buffer.write(data[at:at+1920]); sys.stdout.flush();"
-        " time.sleep(0.002)\n"
-        "time.sleep(60)"
+        f"import os, sys, time; data = open({str(tmp_path / 'six.raw')!r}, 'rb').read(); write = sys.stdout.buffer.write\n"
+        "def say(part): write(part); sys.stdout.flush(); time.sleep(0.01)\n"
+        f"while not os.path.exists({str(begin)!r}): say(bytes(1920))\n"
+        "for at in range(0, len(data), 1920): say(data[at:at+1920])\n"
+        "while True: say(bytes(1920))"
     )
     ports = [f"tcp://127.0.0.1:{free_port(2) + at}" for at in range(2)]
     heard, ego = [], EgoFilter(profile, "linear")
@@ -290,7 +292,9 @@ def test_the_loopback_of_the_device_is_the_reference_where_it_is_named(talking, 
             while sum(map(len, heard)) < 2.2 * RATE:
                 message = await client.read_event()
                 if AudioChunk.is_type(message.type):
-                    heard.append(from_pcm16(AudioChunk.from_event(message).audio))
+                    if begin.exists():
+                        heard.append(from_pcm16(AudioChunk.from_event(message).audio))
+                    begin.touch()
             await client.disconnect()
         finally:
             serving.cancel()
