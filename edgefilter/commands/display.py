@@ -131,7 +131,7 @@ def progress(task: str, at_once: bool = True) -> Iterator[Callable[[str], None]]
     terminal = sys.stderr.isatty()
 
     def tell() -> None:
-        ended = not at_once and over.wait(LINE_PERIOD_S)
+        ended = over.wait(0.0 if at_once else LINE_PERIOD_S)
         while not ended:
             line = f"{time.monotonic() - began:4.0f} s  {shown[0]}"
             _overwrite(line) if terminal else say(line)
@@ -140,12 +140,13 @@ def progress(task: str, at_once: bool = True) -> Iterator[Callable[[str], None]]
             _overwrite("")
 
     thread = threading.Thread(target=tell, daemon=True)
-    thread.start()
     try:
+        thread.start()
         yield lambda step: shown.__setitem__(0, f"{task}: {step}")
     finally:
         over.set()
-        thread.join()
+        with suppress(RuntimeError):  # an interrupt came before it had begun: it will say nothing
+            thread.join()
 
 
 def _overwrite(line: str) -> None:
