@@ -94,8 +94,11 @@ class Workbench:
         without: Collection[str] = (),
         start: EchoModel | None = None,
     ) -> None:
-        self.prepared, self.criteria, self._without = prepared, criteria, without
+        self.prepared, self.criteria = prepared, criteria
         self._start = start or prepared.model
+        # what the start has at neutral values is in its path (Effect.absorbed): no search claims it
+        taken_up = (name for name, values in self._start.effects if vanishes(find(name), values))
+        self._without = {*without, *taken_up}
         self.scorer = Scorer(prepared)
         self._progress = progress
         self._scores: dict[Signature, Score] = {}
@@ -282,12 +285,8 @@ class Workbench:
         return not (by_chance or taken_up)
 
     def absent(self, model: EchoModel, most: int) -> list[str]:
-        """Names of the effects that a model has not, or as the start has them, that may be tried and whose complexity is at most `most`.
-
-        Those that the start has at neutral values are in its path (Effect.absorbed): no search claims them.
-        """
-        taken_up = {name for name, values in self._start.effects if vanishes(find(name), values)}
-        out = {*added(self._start, model), *self._without, *taken_up}
+        """Names of the effects that a model has not, or as the start has them, that may be tried and whose complexity is at most `most`."""
+        out = {*added(self._start, model), *self._without}
         return [name for name in names() if name not in out and find(name).complexity <= most]
 
     def less(self, model: EchoModel, name: str) -> EchoModel:
