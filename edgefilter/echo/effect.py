@@ -12,7 +12,7 @@ from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.errors import UsageError
 from edgefilter.types import Array, Samples
 
-Stage: TypeAlias = Literal["source", "path", "time", "microphone", "noise"]
+Stage: TypeAlias = Literal["source", "response", "path", "time", "microphone", "noise"]
 STAGES: tuple[Stage, ...] = get_args(Stage)
 """In the order in which sound meets them."""
 Family: TypeAlias = Literal[
@@ -58,8 +58,9 @@ class Effect:
     """One physical effect on the robot's own voice. With every parameter at its neutral value, apply is the identity.
 
     A subclass gives name, stage and parameters, and overrides what differs from the defaults below; no other module
-    knows an effect by name. Stage "source" acts on the reference, "path", "time" and "microphone" on the predicted
-    voice at the microphone; "noise" changes the noise that is expected and leaves the voice alone.
+    knows an effect by name. Stage "source" acts on the reference, "response" on the impulse response itself, "path",
+    "time" and "microphone" on the predicted voice at the microphone; "noise" changes the noise that is expected and
+    leaves the voice alone.
 
     What the model asks:
     memory: samples of the past that apply needs on a stream at every hop, 0 for none. None where that is not known, or

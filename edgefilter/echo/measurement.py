@@ -44,6 +44,12 @@ class VoiceModel(Protocol):
     def predict(self, reference: Samples) -> Samples:
         """The robot's voice at the microphone (n,) for an aligned reference (n,)."""
 
+    def response(self) -> Samples:
+        """The linear path with the effects that change it, (taps,)."""
+
+    def over(self, response: Samples) -> VoiceModel:
+        """The model with this response (taps,) in place of its own."""
+
 
 @dataclass(frozen=True, eq=False)
 class Measurement:

@@ -44,17 +44,29 @@ class EchoModel:
     @cached_property
     def _chain(self) -> tuple[Chain, Samples, int, Chain]:
         """Effects ahead; the path and the filters right behind it as one, (taps,); by how much it begins early; effects behind."""
-        applied = chain(self.effects)
-        ahead = [pair for pair in applied if pair[0].stage == "source"]
-        behind = applied[len(ahead) :]
+        ahead, _, behind = self._by_stage
+        path = self.response()
         filters = list(takewhile(lambda pair: pair[0].absorbed, behind))
         if not filters:
-            return ahead, self.impulse_response, 0, behind
-        path = np.pad(self.impulse_response, (LEAD, LONGEST))
-        for effect, values in filters:
-            path = effect.apply(path, values, SAMPLE_RATE)
-        size = max(LEAD + self.impulse_response.size, _heard(path, 1e-6))
-        return ahead, path[:size], LEAD, behind[len(filters) :]
+            return ahead, path, 0, behind
+        whole = _through(filters, np.pad(path, (LEAD, LONGEST)))
+        return ahead, whole[: max(LEAD + path.size, _heard(whole, 1e-6))], LEAD, behind[len(filters) :]
+
+    @property
+    def _by_stage(self) -> tuple[Chain, Chain, Chain]:
+        """The effects ahead of the path, those of its response, and those behind it."""
+        applied = chain(self.effects)
+        ahead, on_it = ([pair for pair in applied if pair[0].stage == stage] for stage in ("source", "response"))
+        return ahead, on_it, applied[len(ahead) + len(on_it) :]
+
+    def response(self) -> Samples:
+        """The impulse response with the effects of stage "response", (taps,)."""
+        return _through(self._by_stage[1], self.impulse_response)
+
+    def over(self, response: Samples) -> EchoModel:
+        """The model with this response (taps,) in place of its own."""
+        replaced = {effect.name for effect, _ in self._by_stage[1]}
+        return replace(self._with_those(lambda name, _: name not in replaced), impulse_response=response)
 
     def unpredictable(self, reference: Samples) -> tuple[tuple[Samples, Array], ...]:
         """Of each source of the noise that effects add: its expected square (n,) at the microphone, and its density (601,) per Hz of integral 1."""
@@ -149,8 +161,9 @@ class EchoModel:
         It is fitted behind the effects that the catalogue puts ahead of it. An event's values say in which recording it happened.
         """
         effect, behind, model = find(name), measurement, self
-        if effect.stage == "source":
-            ahead = list(takewhile(lambda pair: pair[0] is not effect, chain((*self.effects, (name, {})))))
+        if effect.stage in ("source", "response"):
+            before = takewhile(lambda pair: pair[0] is not effect, chain((*self.effects, (name, {}))))
+            ahead = [pair for pair in before if pair[0].stage == "source"]
             if ahead:
                 behind = replace(measurement, reference=_through(ahead, measurement.reference))
             for other, _ in ahead:

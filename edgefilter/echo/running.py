@@ -141,9 +141,9 @@ def reach(effect: Effect, values: Values) -> str:
 
 
 def is_filter(effect: Effect, values: Values) -> bool:
-    """Whether an effect of stage "path", as it is at a recording's end, is linear and the same at all times: by trying it."""
+    """Whether an effect, as it is at a recording's end, belongs to the path: of stage "path" where a trial finds it linear and always the same."""
     if effect.stage != "path":
-        return False
+        return effect.stage == "response"
     values = effect.settled(values)
     a, b = (_probe(seed) for seed in (0, 1))
     one, other = (effect.apply(x, values, SAMPLE_RATE) for x in (a, b))

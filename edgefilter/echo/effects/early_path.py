@@ -5,25 +5,25 @@ from __future__ import annotations
 import numpy as np
 
 from edgefilter.echo.effect import Effect, Parameter, first, neutral, within
-from edgefilter.echo.effects.late_reverb import LEAD, fit_path, rings_longer, with_taps
+from edgefilter.echo.effects.late_reverb import ADDED, fit_path, rings_longer, with_added
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
-from edgefilter.types import SAMPLE_RATE, Samples
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 
 WITHIN = 0.8
 """Part of what is added that has come by within_ms: the rest is the fit's noise and the room's own tail."""
 
 
 class EarlyPath(Effect):
-    """y = x + taps * x: a filter behind the calibrated path, after which the room dies away as it did.
+    """h + added: another impulse response, after which the room dies away as it did.
 
-    taps: (k,) lags -LEAD to k - LEAD. level_db: their energy re the calibrated sound. within_ms: the lag by which
-    WITHIN of it has come. The filter is as long as that of late_reverb: where the microphone is another, so is each
-    reflection.
+    added: (k,) from h's first tap on. level_db: its energy re that of h. within_ms: the lag behind the direct sound by
+    which WITHIN of it has come. It is as long as that of late_reverb: where the microphone is another, so is each
+    reflection. taps: as there.
     """
 
     name = "early_path"
-    stage = "path"
+    stage = "response"
     family = "linear path"
     title = "another path from the start"
     shown_by = ("sweep", "place")
@@ -33,21 +33,21 @@ class EarlyPath(Effect):
     parameters = (
         Parameter("level_db", "dB", -120.0, -120.0, 60.0),
         Parameter("within_ms", "ms", 0.0, -10.0, 1000.0),
-        Parameter("taps", "1", 0.0, -10.0, 10.0),
+        *ADDED,
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        return with_taps(x, values)
+        return with_added(x, values)
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """The taps that fit_path() finds, which late_reverb shares; neutral where none hold on other samples."""
-        taps, _ = measurement.once(fit_path, model)
-        if not taps.any():
+        """What fit_path() finds, which late_reverb shares; neutral where none of it holds on other samples."""
+        added, _ = measurement.once(fit_path, model)
+        if not added.any():
             return neutral(self)
-        grown = np.cumsum(taps**2)
-        level_db = 10.0 * np.log10(grown[-1] + 1e-12)
-        within_ms = 1e3 * (int(np.searchsorted(grown, WITHIN * grown[-1])) - LEAD) / SAMPLE_RATE
-        return within(self, {"level_db": level_db, "within_ms": within_ms, "taps": taps})
+        grown = np.cumsum(added**2)
+        level_db = 10.0 * np.log10(grown[-1] / np.sum(model.response().astype(float) ** 2) + 1e-12)
+        within_ms = 1e3 * (int(np.searchsorted(grown, WITHIN * grown[-1])) - PRE_ROLL) / SAMPLE_RATE
+        return within(self, {"level_db": level_db, "within_ms": within_ms, "added": added})
 
     def sentence(self, values: Values) -> str:
         return (

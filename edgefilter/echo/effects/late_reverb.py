@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from edgefilter.dsp.convolution import convolve
 from edgefilter.dsp.frames import blocks
 from edgefilter.echo.effect import Effect, Parameter, first, neutral, numbers, within
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import LONGEST, convolve_from, fit_filter, fit_supported
-from edgefilter.types import SAMPLE_RATE, Array, Samples
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 LEAD = 32
-"""Taps before lag 0: what a room of other colour changes in the direct sound."""
+"""Taps before lag 0 of the filter of a profile of earlier versions."""
 EXPECTED = 1e-3
 """Expected square of a tap before anything is known of the room, the same at all lags."""
 SLOWER = 1.7
@@ -29,15 +28,20 @@ LONGER, DECAYED = 1.3, 0.01
 s, 0.9 to 1.1 where the change was another one. So far down a sweep's response is clear of its noise."""
 
 
+ADDED = Parameter("added", "1", 0.0, -1e3, 1e3), Parameter("taps", "1", 0.0, -10.0, 10.0)
+"""Of an effect that changes the impulse response."""
+
+
 class LateReverb(Effect):
-    """y = x + taps * x: a long filter behind the calibrated path. Its decay gives the reverberation time.
+    """h + added: another impulse response, that of a longer room. Its decay gives the reverberation time.
 
     rt60_s: from the backward-integrated energy of the whole new response (Schroeder 1965, eq. 5), the first 20 ms left
-    out, above the noise. level_db: energy of the taps after 10 ms, re the direct path. taps: (k,) lags -LEAD to k - LEAD.
+    out, above the noise. level_db: energy of what is added from 10 ms after the direct sound on, re that of h. added:
+    (k,) from h's first tap on. taps: (k,) lags -LEAD to k - LEAD, a filter behind h, in profiles of earlier versions.
     """
 
     name = "late_reverb"
-    stage = "path"
+    stage = "response"
     family = "linear path"
     title = "late reverberation"
     shown_by = ("sweep", "tail", "place")
@@ -46,19 +50,19 @@ class LateReverb(Effect):
     parameters = (
         Parameter("rt60_s", "s", 0.0, 0.0, 10.0),
         Parameter("level_db", "dB", -120.0, -120.0, 40.0),
-        Parameter("taps", "1", 0.0, -10.0, 10.0),
+        *ADDED,
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        return with_taps(x, values)
+        return with_added(x, values)
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """The taps that fit_path() finds, which early_path shares; neutral where none hold on other samples."""
-        taps, rt60 = measurement.once(fit_path, model)
-        if not taps.any():
+        """What fit_path() finds, which early_path shares; neutral where none of it holds on other samples."""
+        added, rt60 = measurement.once(fit_path, model)
+        if not added.any():
             return neutral(self)
-        late = float(np.sum(taps[LEAD + SAMPLE_RATE // 100 :] ** 2))
-        return within(self, {"rt60_s": rt60, "level_db": 10 * np.log10(late + 1e-12), "taps": taps})
+        late = float(np.sum(added[PRE_ROLL + SAMPLE_RATE // 100 :] ** 2) / np.sum(model.response() ** 2))
+        return within(self, {"rt60_s": rt60, "level_db": 10 * np.log10(late + 1e-12), "added": added})
 
     def sentence(self, values: Values) -> str:
         return (
@@ -68,52 +72,55 @@ class LateReverb(Effect):
 
     def only(self, values: Values) -> Values:
         """The direct sound as it was."""
-        taps = numbers(values, "taps").copy()
-        taps[: LEAD + DIRECT] = 0.0
-        return {**values, "taps": taps}
+        added = numbers(values, "added").copy()
+        added[: PRE_ROLL + DIRECT] = 0.0
+        return {**values, "added": added}
 
     def plausible(self, evidence: Evidence) -> bool:
         """Whether the room is longer: a loudspeaker of another colour or a path that moved fill a filter this long as well."""
         return rings_longer(evidence)
 
 
-def with_taps(x: Samples, values: Values) -> Samples:
-    """The signal x (n,) and what the taps at lags -LEAD to k - LEAD add to it."""
-    taps = numbers(values, "taps")
-    return x + convolve_from(x, taps, LEAD) if taps.any() else x.copy()
+def with_added(response: Samples, values: Values) -> Samples:
+    """The response (k,) with what is added to it, or what a filter behind it adds, (m,)."""
+    added, taps = numbers(values, "added"), numbers(values, "taps")
+    longer = np.pad(response, (0, max(added.size, response.size + taps.size) - response.size))
+    longer[: added.size] += added.astype(np.float32)
+    return longer + convolve_from(longer, taps, LEAD) if taps.any() else longer
 
 
 def fit_path(measurement: Measurement, model: VoiceModel) -> tuple[Array, float]:
-    """Taps at lags -LEAD to k - LEAD behind the calibrated path, (k,), zeros where none hold on other samples; RT60 of the new path in s.
+    """What is added to the response, (k,), zeros where none of it holds on other samples; RT60 of the new response in s.
 
     Least squares in the whitened domain, slightly regularised, then once more with taps that are expected to decay as the
     room that was found does: some seconds of speech do not teach ten thousand.
     """
-    x = measurement.predicted(model)[1]
-    residual = measurement.white_recording - x
+    before = model.response().astype(np.float64)
+    scale = np.sqrt(np.sum(before**2))
+    x = measurement.predicted(model.over(np.array([scale], np.float32)))[1]
+    residual = measurement.white_recording - measurement.predicted(model)[1]
     length = min(LONGEST, measurement.recording.size // 4)
-    taps = fit_supported(x, residual, measurement.weights, LEAD, np.full(length, EXPECTED))
+    taps = fit_supported(x, residual, measurement.weights, 0, np.full(length, EXPECTED))
     if not taps.any():
         return taps, 0.0
-    response = convolve(model.impulse_response.astype(np.float64), taps)[LEAD:]
-    response[: model.impulse_response.size] += model.impulse_response
-    direct = int(np.argmax(np.abs(model.impulse_response)))
-    rt60 = reverberation_time(response[direct : taps.size - LEAD])
-    rt60 = rt60 or reverberation_time(model.impulse_response[direct:].astype(np.float64))
+    after = scale * taps
+    after[: before.size] += before[:length]
+    direct = int(np.argmax(np.abs(before)))
+    rt60 = reverberation_time(after[direct:]) or reverberation_time(before[direct:])
     if rt60 > 0.0:
-        taps = fit_filter(x, residual, measurement.weights, length, LEAD, decaying(taps, SLOWER * rt60), steps=60)
-    return taps, rt60
+        taps = fit_filter(x, residual, measurement.weights, length, 0, decaying(taps, SLOWER * rt60), steps=60)
+    return scale * taps, rt60
 
 
 def rings_longer(evidence: Evidence) -> bool:
     """Whether a good part of what taps add, a gain apart, comes after early reflections, and the whole decays more slowly."""
-    path = evidence.model.impulse_response.astype(np.float64)
+    path = evidence.model.response().astype(np.float64)
     direct = int(np.argmax(np.abs(path)))
-    before, added = path[direct:], convolve(path, numbers(evidence.values, "taps"))[LEAD + direct :]
-    after = added.copy()
-    after[: before.size] += before[: added.size]
-    known = np.pad(before, (0, max(added.size - before.size, 0)))[: added.size]
-    added -= float(added @ known) / float(known @ known) * known
+    before, added = path[direct:], numbers(evidence.values, "added")[direct:]
+    after = np.pad(before, (0, max(added.size - before.size, 0)))
+    known = after[: added.size].copy()
+    after[: added.size] += added
+    added = added - float(added @ known) / float(known @ known) * known
     late = float(np.sum(added[EARLY:] ** 2)) >= LATE_SHARE * float(np.sum(added**2))
     return late and decay(after) > LONGER * decay(before)
 
