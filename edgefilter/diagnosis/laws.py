@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import product
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from edgefilter.diagnosis.closer_look import BEAT, Curve, by_rate
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.score import Scorer, share_of
 from edgefilter.diagnosis.trials import Found
-from edgefilter.dsp.frames import block_power, block_sums, decibels
+from edgefilter.dsp.frames import block_power, block_sums, blocks, decibels
 from edgefilter.echo.evidence import Score
 from edgefilter.echo.least_squares import normal_equations
 from edgefilter.echo.model import EchoModel
@@ -27,8 +27,14 @@ STEP = 16
 KNOTS, SPACING_DB = 11, 5.0
 """Of the gain over the level, down from the loudest: below lies what the fan hides."""
 ATTACKS_MS, RELEASES_MS = (0.5, 3.0, 15.0, 60.0, 300.0), (10.0, 40.0, 150.0, 600.0, 2000.0)
+AHEAD_MS = (0, 1, 2, 4, 8)
+"""By which the level is heard before the sound that it acts on: a limiter that holds the sound back for so long."""
+LEVELS = {"mean": 6.0, "max": 15.0}
+"""What a step counts by, the mean square or the peak's, and dB over the loudest 20 ms that it may reach."""
 FINER = (2.0, 1.4)
 """Ratios of times that are tried next on either side of the best."""
+Setting: TypeAlias = tuple[float, float, int, str]
+"""Of a level: attack and release in ms, by how many ms it is heard ahead, and what a step counts by."""
 BEND = 1e-4
 """Weight of a curve's second differences, re the voice's mean energy at a knot: where speech hardly comes it goes on as beside it."""
 RATES_HZ = (0.5, 150.0)
@@ -82,7 +88,7 @@ class Law:
         return np.interp(x, INPUT, OUTPUT)"""
 DYNAMICS = """LEVEL_DB = {level}
 GAIN_DB = {gain}
-ATTACK_MS, RELEASE_MS = {attack:.3g}, {release:.3g}
+ATTACK_MS, RELEASE_MS, AHEAD_MS = {attack:.3g}, {release:.3g}, {ahead}
 
 
 class Law:
@@ -91,7 +97,8 @@ class Law:
 
     def __call__(self, x, heard=None):
         gains = [self.gain]
-        for power in np.mean(np.pad(x, (0, -x.size % {step})).reshape(-1, {step}).astype(float) ** 2, axis=1):
+        powers = np.{of}(np.pad(x, (0, -x.size % {step})).reshape(-1, {step}).astype(float) ** 2, axis=1)
+        for power in powers[np.minimum(np.arange(powers.size) + AHEAD_MS, powers.size - 1)]:
             ms = ATTACK_MS if power > self.power else RELEASE_MS
             self.power += (1 - np.exp(-1 / ms)) * (power - self.power)
             gains.append(10 ** (np.interp(10 * np.log10(self.power + 1e-12), LEVEL_DB, GAIN_DB) / 20))
@@ -288,37 +295,43 @@ def static_curve(ground: _Ground) -> Law:
 def dynamics(ground: _Ground) -> Law:
     """g(L) x, L the level of x, its power smoothed with an attack and a release: compressor, limiter, expander, gate, normaliser."""
     loud_db = float(decibels(np.max(block_power(ground.x, SAMPLE_RATE // 50))))
-    knots = np.ceil(loud_db) + 6.0 + SPACING_DB * np.arange(-KNOTS + 1.0, 1.0)
+    knots = {of: np.ceil(loud_db) + over + SPACING_DB * np.arange(-KNOTS + 1.0, 1.0) for of, over in LEVELS.items()}
     bends = np.concatenate((np.diff(np.eye(KNOTS), 2, axis=0), 0.1 * np.diff(np.eye(KNOTS), axis=0)))
     energy, cross = (
         block_sums(np.roll(ground.heard * other * ground.weights, -ground.lag), STEP)
         for other in (ground.heard, ground.target)
     )
 
-    def best(settings: list[tuple[float, float]]) -> tuple[float, float]:
-        def worth(level: Array) -> float:
-            hats = _hats(level, knots)
+    def best(settings: list[Setting]) -> Setting:
+        def worth(level: Array, of: str) -> float:
+            hats = _hats(level, knots[of])
             return _solved((hats * energy) @ hats.T, hats @ cross, bends)[1]
 
-        return settings[int(np.argmax([worth(level) for level in _levels(ground.x, settings)]))]
+        levels = _levels(ground.x, settings)
+        return settings[int(np.argmax([worth(level, of) for level, (*_, of) in zip(levels, settings, strict=True)]))]
 
-    attack, release = best(list(product(ATTACKS_MS, RELEASES_MS)))
+    attack, release, *_ = best(list(product(ATTACKS_MS, RELEASES_MS, (0,), ("mean",))))
+    attack, release, ahead, of = best(list(product((attack,), (release,), AHEAD_MS, LEVELS)))
+    attack, release, *_ = best(list(product(ATTACKS_MS, RELEASES_MS, (ahead,), (of,))))
     for ratio in FINER:
         around = (1.0 / ratio, 1.0, ratio)
-        attack, release = best([(attack * a, release * r) for a, r in product(around, around)])
-    level = _levels(ground.x, [(attack, release)])[0]
+        attack, release, *_ = best([(attack * a, release * r, ahead, of) for a, r in product(around, around)])
+    level, knots = _levels(ground.x, [(attack, release, ahead, of)])[0], knots[of]
     drawn = np.interp(np.arange(ground.x.size) / STEP, np.arange(level.size + 1), np.concatenate((level[:1], level)))
     gain = ground.solve([ground.x * hat.astype(np.float32) for hat in _hats(drawn, knots)], bends)
     gain_db = np.clip(20.0 * np.log10(np.maximum(gain, 1e-3)), -40.0, 40.0)
-    reached = knots > float(np.quantile(level, 0.5)) - SPACING_DB
-    slopes = np.diff(gain_db) / SPACING_DB * reached[1:] * (knots[1:] < loud_db + SPACING_DB)
+    usual, loudest = np.quantile(level, (0.5, 0.99))
+    reached = knots > usual - SPACING_DB
+    slopes = np.diff(gain_db) / SPACING_DB * reached[1:] * (knots[1:] < loudest + SPACING_DB)
     steepest = int(np.argmax(np.abs(slopes)))
     words = (
         f"a gain that {'falls' if slopes[steepest] < 0 else 'rises'} {abs(10 * slopes[steepest]):.1f} dB per 10 dB of level"
         f" around {knots[steepest] + SPACING_DB / 2:.0f} dBFS within {attack:.2g} ms, and comes back in {release:.3g} ms"
+        + (f"; it begins {ahead} ms before the sound that it acts on" if ahead else "")
     )
     curve = Curve.of("level", "dBFS", knots[reached], gain_db[reached], 1.0)
-    code = DYNAMICS.format(level=_array(knots, 1), gain=_array(gain_db, 2), attack=attack, release=release, step=STEP)
+    times = {"attack": attack, "release": release, "ahead": ahead, "of": of, "step": STEP}
+    code = DYNAMICS.format(level=_array(knots, 1), gain=_array(gain_db, 2), **times)
     return Law("dynamics", words, ground.stage, curve, code)
 
 
@@ -390,12 +403,16 @@ STAGES: dict[Callable[[_Ground], Law | None], tuple[Literal["source", "path"], .
 """The families, and where each may stand: ahead of the path, or behind it."""
 
 
-def _levels(x: Samples, settings: list[tuple[float, float]]) -> Array:
-    """Level in dB at the end of each step of x (n,), by m attacks and releases in ms, (m, k)."""
-    power = block_power(x, STEP)
-    rising, falling = (-np.expm1(-1.0 / np.array(ms)) for ms in zip(*settings, strict=True))
-    level, now = np.empty((power.size, len(settings))), np.zeros(len(settings))
-    for row, asked in zip(level, power, strict=True):
+def _levels(x: Samples, settings: list[Setting]) -> Array:
+    """Level in dB at the end of each step of x (n,), by m settings, (m, k)."""
+    attacks, releases, *_ = zip(*settings, strict=True)
+    rising, falling = (-np.expm1(-1.0 / np.array(ms)) for ms in (attacks, releases))
+    squares = blocks(x, STEP).astype(float) ** 2
+    powers = {"mean": squares.mean(axis=1), "max": squares.max(axis=1)}
+    last, steps = len(squares) - 1, np.arange(len(squares))
+    wanted = np.stack([powers[of][np.minimum(steps + ahead, last)] for *_, ahead, of in settings], axis=1)
+    level, now = np.empty(wanted.shape), np.zeros(len(settings))
+    for row, asked in zip(level, wanted, strict=True):
         step = asked - now
         now = now + np.where(step > 0.0, rising, falling) * step
         row[:] = now
