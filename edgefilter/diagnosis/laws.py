@@ -310,12 +310,16 @@ def dynamics(ground: _Ground) -> Law:
         levels = _levels(ground.x, settings)
         return settings[int(np.argmax([worth(level, of) for level, (*_, of) in zip(levels, settings, strict=True)]))]
 
-    attack, release, *_ = best(list(product(ATTACKS_MS, RELEASES_MS, (0,), ("mean",))))
-    attack, release, ahead, of = best(list(product((attack,), (release,), AHEAD_MS, LEVELS)))
-    attack, release, *_ = best(list(product(ATTACKS_MS, RELEASES_MS, (ahead,), (of,))))
-    for ratio in FINER:
-        around = (1.0 / ratio, 1.0, ratio)
-        attack, release, *_ = best([(attack * a, release * r, ahead, of) for a, r in product(around, around)])
+    def refined(ahead: int, of: str) -> Setting:
+        attack, release, *_ = best(list(product(ATTACKS_MS, RELEASES_MS, (ahead,), (of,))))
+        for ratio in FINER:
+            around = (1.0 / ratio, 1.0, ratio)
+            attack, release, *_ = best([(attack * a, release * r, ahead, of) for a, r in product(around, around)])
+        return attack, release, ahead, of
+
+    plain = refined(0, "mean")
+    _, _, ahead, of = best([(*plain[:2], ahead, of) for ahead, of in product(AHEAD_MS, LEVELS)])
+    attack, release, ahead, of = best([plain, refined(ahead, of)])
     level, knots = _levels(ground.x, [(attack, release, ahead, of)])[0], knots[of]
     drawn = np.interp(np.arange(ground.x.size) / STEP, np.arange(level.size + 1), np.concatenate((level[:1], level)))
     gain = ground.solve([ground.x * hat.astype(np.float32) for hat in _hats(drawn, knots)], bends)

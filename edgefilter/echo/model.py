@@ -61,7 +61,8 @@ class EchoModel:
 
     def response(self) -> Samples:
         """The impulse response with the effects of stage "response", (taps,)."""
-        return _through(self._by_stage[1], self.impulse_response)
+        changed = _through(self._by_stage[1], np.pad(self.impulse_response, (0, LONGEST)))
+        return changed[: max(self.impulse_response.size, _heard(changed, 1e-6))]
 
     def over(self, response: Samples) -> EchoModel:
         """The model with this response (taps,) in place of its own."""

@@ -117,13 +117,23 @@ def test_prediction_without_effects_is_the_convolution() -> None:
 
 def test_filters_behind_the_path_are_applied_as_one_with_it() -> None:
     x = speech(2.0)
-    values = {"bandlimit": {"cutoff_hz": 3000.0, "order": 6.0}, "early_path": {"taps": np.eye(1, 900, 700)[0] * 0.3}}
+    values = {"bandlimit": {"cutoff_hz": 3000.0, "order": 6.0}, "equaliser": {"taps": np.eye(1, 90, 70)[0] * 0.3}}
     whole, one_by_one = model(), model().predict(x)
     for name, given in values.items():
         whole = whole.with_effect(name, given)
         one_by_one = catalogue.find(name).apply(one_by_one, complete(catalogue.find(name), given), 16000)
     inside = slice(1000, -1000)  # at the end the one by one hear no echo of what the recording cuts off
     assert rms((whole.predict(x) - one_by_one)[inside]) < 1e-4 * rms(one_by_one)
+
+
+def test_what_is_added_to_the_response_comes_from_the_reference_and_an_older_filter_from_behind_the_path() -> None:
+    x, h = speech(2.0), model().impulse_response
+    added, taps = np.eye(1, 900, 700)[0] * 0.3, np.eye(1, 900, 732)[0] * 0.2
+    changed = model().with_effect("early_path", {"added": added, "taps": taps})
+    expected = np.convolve(x, h)[: x.size] + 0.3 * np.pad(x, (700, 0))[: x.size]
+    expected += 0.2 * np.pad(np.convolve(x, h), (700, 0))[: x.size]
+    np.testing.assert_allclose(changed.predict(x), expected, atol=1e-5)
+    np.testing.assert_array_equal(changed.response(), changed.running_response()[: changed.response().size])
 
 
 def test_with_effect_replaces_and_without_removes() -> None:

@@ -82,11 +82,11 @@ class LateReverb(Effect):
 
 
 def with_added(response: Samples, values: Values) -> Samples:
-    """The response (k,) with what is added to it, or what a filter behind it adds, (m,)."""
-    added, taps = numbers(values, "added"), numbers(values, "taps")
-    longer = np.pad(response, (0, max(added.size, response.size + taps.size) - response.size))
-    longer[: added.size] += added.astype(np.float32)
-    return longer + convolve_from(longer, taps, LEAD) if taps.any() else longer
+    """The response (k,) with what is added to it, or what a filter behind it adds, (k,)."""
+    added, taps = numbers(values, "added")[: response.size], numbers(values, "taps")
+    changed = response + convolve_from(response, taps, LEAD) if taps.any() else response.copy()
+    changed[: added.size] += added.astype(np.float32)
+    return changed
 
 
 def fit_path(measurement: Measurement, model: VoiceModel) -> tuple[Array, float]:

@@ -9,7 +9,7 @@ from scipy import signal
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.effects.catalogue import find
-from edgefilter.echo.effects.late_reverb import EXPECTED, LEAD
+from edgefilter.echo.effects.late_reverb import EXPECTED
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.wiener import convolve_from, fit_filter
@@ -64,17 +64,12 @@ def test_late_reverberation_and_its_time_are_found() -> None:
 def test_what_is_known_of_a_decaying_room_helps_where_little_was_heard() -> None:
     office, model = in_an_office(6.0), EchoModel(path())
     left, values = excess_db("late_reverb", office)
-    x = office.predicted(model)[1]
-    flat = fit_filter(
-        x,
-        office.white_recording - x,
-        office.weights,
-        values["taps"].size,
-        LEAD,
-        prior=np.full(values["taps"].size, EXPECTED),
-        steps=40,
-    )
-    with_flat = office.white_recording - x - convolve_from(x, flat, LEAD)
+    scale = np.sqrt(np.sum(np.square(path(), dtype=float)))
+    x = office.predicted(EchoModel(np.array([scale], np.float32)))[1]
+    before = office.white_recording - office.predicted(model)[1]
+    taps = values["added"].size
+    flat = fit_filter(x, before, office.weights, taps, 0, prior=np.full(taps, EXPECTED), steps=40)
+    with_flat = before - convolve_from(x, flat, 0)
     assert left < 10 * np.log10(np.mean(with_flat[~office.fit].astype(float) ** 2)) - 0.5
 
 
