@@ -76,7 +76,7 @@ def _followed(wanted: Sequence[str]) -> list[str]:
     wished = [find(name) for name in wanted]
     left = {
         "additive noise",
-        *("linear path" for effect in wished if effect.stage == "path" and effect.flexible),
+        *("linear path" for effect in wished if effect.stage in ("response", "path") and effect.flexible),
         *("time" for effect in wished if effect.family == "time" and not effect.followed),
     }
     return [name for name in names() if find(name).followed and name not in wanted and find(name).family not in left]
