@@ -102,6 +102,10 @@ class Effect:
         """The effect on a stream, for one that remembers much or follows what the microphone hears; None: apply is all there is."""
         return None
 
+    def share(self, values: Values, size: int, sample_rate: int) -> Samples | None:
+        """Of stage "response": how much of its change holds at each sample, (size,) 0 to 1; None, by default, for all of it always."""
+        return None
+
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Values with which the model, this effect added, comes closest to the recording; by default the neutral ones."""
         return neutral(self)

@@ -37,20 +37,28 @@ class EchoModel:
 
     def predict(self, reference: Samples) -> Samples:
         """The robot's voice at the microphone (n,) for an aligned reference (n,), all effects applied."""
-        ahead, path, lead, behind = self._chain
-        played = convolve(_through(ahead, reference), path)[lead:][: reference.size]
-        return _through(behind, played.astype(np.float32, copy=False))
+        ahead, paths, lead, behind = self._chain
+        x, n = _through(ahead, reference), reference.size
+        played = np.zeros(n, np.float32)
+        for path, changing in paths:
+            heard = convolve(x, path)[lead:][:n].astype(np.float32, copy=False)
+            share = None if changing is None else changing[0].share(changing[1], n, SAMPLE_RATE)
+            played += heard if share is None else share * heard
+        return _through(behind, played)
 
     @cached_property
-    def _chain(self) -> tuple[Chain, Samples, int, Chain]:
-        """Effects ahead; the path and the filters right behind it as one, (taps,); by how much it begins early; effects behind."""
-        ahead, _, behind = self._by_stage
+    def _chain(self) -> tuple[Chain, list[tuple[Samples, tuple[Effect, Values] | None]], int, Chain]:
+        """Effects ahead; the path and each later change of it, (taps,) with the filters right behind; their lead; effects behind."""
+        ahead, on_it, behind = self._by_stage
         path = self.response()
+        later = [pair for pair in on_it if pair[0].event]
+        longer = np.pad(path, (0, LONGEST))
+        paths = [(path, None), *((_trimmed(e.apply(longer, v, SAMPLE_RATE) - longer), (e, v)) for e, v in later)]
         filters = list(takewhile(lambda pair: pair[0].absorbed, behind))
         if not filters:
-            return ahead, path, 0, behind
-        whole = _through(filters, np.pad(path, (LEAD, LONGEST)))
-        return ahead, whole[: max(LEAD + path.size, _heard(whole, 1e-6))], LEAD, behind[len(filters) :]
+            return ahead, paths, 0, behind
+        whole = [(_trimmed(_through(filters, np.pad(each, (LEAD, LONGEST)))), changing) for each, changing in paths]
+        return ahead, whole, LEAD, behind[len(filters) :]
 
     @property
     def _by_stage(self) -> tuple[Chain, Chain, Chain]:
@@ -60,8 +68,9 @@ class EchoModel:
         return ahead, on_it, applied[len(ahead) + len(on_it) :]
 
     def response(self) -> Samples:
-        """The impulse response with the effects of stage "response", (taps,)."""
-        changed = _through(self._by_stage[1], np.pad(self.impulse_response, (0, LONGEST)))
+        """The impulse response with the effects of stage "response" that hold from the start, (taps,)."""
+        always = [pair for pair in self._by_stage[1] if not pair[0].event]
+        changed = _through(always, np.pad(self.impulse_response, (0, LONGEST)))
         return changed[: max(self.impulse_response.size, _heard(changed, 1e-6))]
 
     def over(self, response: Samples) -> EchoModel:
@@ -189,6 +198,11 @@ def _through(effects: Chain, x: Samples) -> Samples:
     for effect, values in effects:
         x = effect.apply(x, values, SAMPLE_RATE)
     return x
+
+
+def _trimmed(response: Samples) -> Samples:
+    """A response up to its last tap that is heard at all."""
+    return response[: max(_heard(response, 1e-6), 1)]
 
 
 def _heard(response: Samples, share: float) -> int:

@@ -81,10 +81,10 @@ class LateReverb(Effect):
         return rings_longer(evidence)
 
 
-def with_added(response: Samples, values: Values) -> Samples:
-    """The response (k,) with what is added to it, or what a filter behind it adds, (k,)."""
+def with_added(response: Samples, values: Values, lead: int = LEAD) -> Samples:
+    """The response (k,) with what is added to it, or what a filter behind it adds, its taps from lag -lead on, (k,)."""
     added, taps = numbers(values, "added")[: response.size], numbers(values, "taps")
-    changed = response + convolve_from(response, taps, LEAD) if taps.any() else response.copy()
+    changed = response + convolve_from(response, taps, lead) if taps.any() else response.copy()
     changed[: added.size] += added.astype(np.float32)
     return changed
 
@@ -96,9 +96,7 @@ def fit_path(measurement: Measurement, model: VoiceModel) -> tuple[Array, float]
     room that was found does: some seconds of speech do not teach ten thousand.
     """
     before = model.response().astype(np.float64)
-    scale = np.sqrt(np.sum(before**2))
-    x = measurement.predicted(model.over(np.array([scale], np.float32)))[1]
-    residual = measurement.white_recording - measurement.predicted(model)[1]
+    x, residual, scale = beside(measurement, model)
     length = min(LONGEST, measurement.recording.size // 4)
     taps = fit_supported(x, residual, measurement.weights, 0, np.full(length, EXPECTED))
     if not taps.any():
@@ -110,6 +108,13 @@ def fit_path(measurement: Measurement, model: VoiceModel) -> tuple[Array, float]
     if rt60 > 0.0:
         taps = fit_filter(x, residual, measurement.weights, length, 0, decaying(taps, SLOWER * rt60), steps=60)
     return scale * taps, rt60
+
+
+def beside(measurement: Measurement, model: VoiceModel) -> tuple[Samples, Samples, float]:
+    """What a single tap as strong as the response would bring, and what the model leaves, whitened, (n,) each; that tap."""
+    scale = float(np.sqrt(np.sum(np.square(model.response(), dtype=np.float64))))
+    tap = measurement.predicted(model.over(np.array([scale], np.float32)))[1]
+    return tap, measurement.white_recording - measurement.predicted(model)[1], scale
 
 
 def rings_longer(evidence: Evidence) -> bool:

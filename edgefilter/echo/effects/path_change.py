@@ -5,14 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from edgefilter.dsp.frames import block_power
-from edgefilter.echo.effect import NEVER_S, Effect, Parameter, first, neutral, numbers, within
+from edgefilter.echo.effect import NEVER_S, Effect, Parameter, first, neutral, within
+from edgefilter.echo.effects.late_reverb import ADDED, beside, with_added
 from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import convolve_from, fit_supported
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 
 TAPS, EXPECTED = 3072, 1e-2
-"""Of the new path behind the old one, 0.2 s; and the expected square of each."""
+"""Of what is added, 0.2 s; and the expected square of each, re the energy of the calibrated response."""
 BLOCK = SAMPLE_RATE // 10
 """Samples (100 ms) of the steps in which the moment is looked for at first."""
 MARGIN = 1.5
@@ -22,13 +23,14 @@ SLACK = 6.0
 
 
 class PathChange(Effect):
-    """y = x until time_s, then x + taps * x, faded over in duration_s around it.
+    """h until time_s, then h + added, faded over in duration_s around it; a time_s of 1e6 s is never.
 
-    taps: (k,) lags -PRE_ROLL to k - PRE_ROLL: the new path behind the calibrated one. A time_s of 1e6 s is never.
+    added: (k,) from h's first tap on. taps: (k,) lags -PRE_ROLL to k - PRE_ROLL, a filter behind h, in profiles of earlier
+    versions.
     """
 
     name = "path_change"
-    stage = "path"
+    stage = "response"
     family = "linear path"
     run_note = "the running filter begins with the path as it was after the change"
     title = "a changed path"
@@ -39,33 +41,29 @@ class PathChange(Effect):
     parameters = (
         Parameter("time_s", "s", NEVER_S, 0.0, NEVER_S),
         Parameter("duration_s", "s", 0.01, 0.0, 10.0),
-        Parameter("taps", "1", 0.0, -10.0, 10.0),
+        *ADDED,
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        taps, time = numbers(values, "taps"), float(values["time_s"])
-        if not taps.any() or time >= x.size / sample_rate:
-            return x.copy()
-        return x + _fade(x.size, time, float(values["duration_s"]), sample_rate) * convolve_from(x, taps, PRE_ROLL)
+        """The new response, that of after the change."""
+        return with_added(x, values, PRE_ROLL) if float(values["time_s"]) < NEVER_S else x.copy()
 
-    def settled(self, values: Values) -> Values:
-        """Values with which the new path holds from the start."""
-        return {**values, "time_s": -1.0, "duration_s": 0.0} if float(values["time_s"]) < NEVER_S else values
+    def share(self, values: Values, size: int, sample_rate: int) -> Samples:
+        return _fade(size, float(values["time_s"]), float(values["duration_s"]), sample_rate)
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """The time by the step in the residual, the new path by least squares after it, in turn; neutral where that does not hold.
 
         The moment alone is chosen on all samples, since it may fall between those that the fit may use.
         """
-        x = measurement.predicted(model)[1]
-        residual = measurement.white_recording - x
-        time = _step(residual, x)
+        x, residual, scale = beside(measurement, model)
+        time = _step(residual, measurement.predicted(model)[1])
         for _ in range(2):
             after = measurement.weights * (np.arange(x.size) > (time + 0.3) * SAMPLE_RATE)
-            taps = fit_supported(x, residual, after, PRE_ROLL, np.full(TAPS, EXPECTED))
+            taps = fit_supported(x, residual, after, 0, np.full(TAPS, EXPECTED))
             if not taps.any():
                 return neutral(self)
-            change = convolve_from(x, taps, PRE_ROLL)
+            change = convolve_from(x, taps, 0)
             time = _best_time(residual, change, measurement.weights)
         errors = {}
         for length in (0.01, 0.3, 0.6, 1.0):
@@ -75,7 +73,8 @@ class PathChange(Effect):
         most = min(errors.values()) + SLACK
         as_good = [found for found, error in errors.items() if error <= most]
         time, duration = min(as_good, key=lambda found: (found[1], abs(found[0] - time)))
-        return within(self, {"time_s": min(time, x.size / SAMPLE_RATE), "duration_s": duration, "taps": taps})
+        time = min(time, x.size / SAMPLE_RATE)
+        return within(self, {"time_s": time, "duration_s": duration, "added": scale * taps})
 
     def sentence(self, values: Values) -> str:
         return f"until {first(values, 'time_s'):.2f} s the calibrated path holds, from then on another one"
