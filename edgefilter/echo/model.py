@@ -10,12 +10,11 @@ from typing import TypeAlias
 
 import numpy as np
 
-from edgefilter.dsp.convolution import convolve
 from edgefilter.echo.effect import RECORDING, Effect, complete, vanishes
 from edgefilter.echo.effects.catalogue import chain, find
 from edgefilter.echo.measurement import Measurement, Values
 from edgefilter.echo.running import is_filter
-from edgefilter.echo.wiener import LONGEST
+from edgefilter.echo.wiener import LONGEST, convolve_from
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 LEAD = 1024
@@ -41,7 +40,7 @@ class EchoModel:
         x, n = _through(ahead, reference), reference.size
         played = np.zeros(n, np.float32)
         for path, changing in paths:
-            heard = convolve(x, path)[lead:][:n].astype(np.float32, copy=False)
+            heard = convolve_from(x, path, lead)
             share = None if changing is None else changing[0].share(changing[1], n, SAMPLE_RATE)
             played += heard if share is None else share * heard
         return _through(behind, played)

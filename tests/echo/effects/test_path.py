@@ -116,6 +116,39 @@ def test_a_changed_path_is_found_with_its_time() -> None:
     assert left < 1.0
 
 
+def somewhere(seed: int) -> np.ndarray:
+    """A response in a room with a reverberation time of 0.25 s, which is half as loud as the direct sound, (4000,)."""
+    rng, t = np.random.default_rng(seed), np.arange(4000 - PRE_ROLL - 20)
+    response, tail = np.zeros(4000), rng.standard_normal(t.size) * 10 ** (-3 * t / (0.25 * 16000))
+    response[PRE_ROLL], response[PRE_ROLL + 20 :] = 0.1, 0.05 * tail / np.sqrt(np.sum(tail**2))
+    return response.astype(np.float32)
+
+
+@pytest.mark.parametrize("name", ["early_path", "path_change"])
+def test_a_robot_that_was_moved_is_explained_though_no_short_filter_turns_one_place_into_the_other(name: str) -> None:
+    x, rng = delayed(voice(16.0), DELAY - PRE_ROLL), np.random.default_rng(7)
+    there, here = (signal.fftconvolve(x, somewhere(seed))[: x.size] for seed in (1, 2))
+    moved = here if name == "early_path" else np.where(np.arange(x.size) < 8.0 * 16000, there, here)
+    measurement = measure(moved + FAN * rng.standard_normal(x.size), voice(16.0))
+    model = EchoModel(somewhere(1)).fit(name, measurement)
+    left = measurement.whiten(measurement.recording - model.predict(measurement.reference))[~measurement.fit]
+    assert 10 * np.log10(np.mean(left.astype(float) ** 2)) < 1.0
+    np.testing.assert_allclose(model.running_response()[:2000], somewhere(2)[:2000], atol=0.005)
+
+
+def test_a_changed_path_is_faded_over_to_and_goes_through_the_filters_behind_it() -> None:
+    x, added = voice(3.0), np.eye(1, 300, 200)[0] * 0.1
+    band = {"cutoff_hz": 4000.0, "order": 6.0, "phase": 1.0}
+    old = EchoModel(path()).with_effect("bandlimit", band)
+    new = old.with_effect("early_path", {"added": added})
+    change = old.with_effect("path_change", {"time_s": 1.5, "duration_s": 1.0, "added": added})
+    share = np.clip(np.arange(x.size) / 16000 - 1.0, 0.0, 1.0)
+    expected = (1.0 - share) * old.predict(x) + share * new.predict(x)
+    np.testing.assert_allclose(change.predict(x), expected, atol=2e-5 * np.abs(expected).max())
+    never = change.with_effect("path_change", {"added": added})
+    np.testing.assert_allclose(never.predict(x), old.predict(x), atol=1e-6)
+
+
 def test_what_runs_is_the_path_with_its_stationary_effects() -> None:
     x = voice(3.0)
     model = EchoModel(path())
