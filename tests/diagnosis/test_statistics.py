@@ -64,7 +64,7 @@ def test_what_a_simpler_effect_leaves_nothing_to_is_spared_and_said(diagnosed):
 def test_a_filter_counts_as_many_numbers_as_hold_its_energy():
     alone, even, fading = np.zeros(800), np.ones(800), 0.9 ** np.arange(800)
     alone[3] = 0.5
-    sizes = [size_of("early_path", {"taps": taps}) for taps in (alone, even, fading)]
+    sizes = [size_of("early_path", {"added": taps}) for taps in (alone, even, fading)]
     assert sizes[:2] == pytest.approx([1.0, 800.0]) and 5 < sizes[2] < 30  # energy falls by e in 4.7 taps
 
 

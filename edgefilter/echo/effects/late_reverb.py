@@ -28,8 +28,8 @@ LONGER, DECAYED = 1.3, 0.01
 s, 0.9 to 1.1 where the change was another one. So far down a sweep's response is clear of its noise."""
 
 
-ADDED = Parameter("added", "1", 0.0, -1e3, 1e3), Parameter("taps", "1", 0.0, -10.0, 10.0)
-"""Of an effect that changes the impulse response."""
+ADDED = Parameter("added", "1", 0.0, -1e3, 1e3), Parameter("taps", "1", 0.0, -10.0, 10.0, given=True)
+"""Of an effect that changes the impulse response; taps only come from profiles of earlier versions."""
 
 
 class LateReverb(Effect):
