@@ -480,12 +480,12 @@ def test_a_damaged_part_of_what_a_linear_path_leaves_is_one_line(tmp_path, name,
 def test_the_effects_of_a_profile_are_told_in_figures_that_people_read_and_in_json_as_they_are(tmp_path, capsys):
     values = {"rt60_s": 0.61283746, "level_db": -9.000000123}
     bent = {"resonance_hz": 234.5678, "force_factor": np.array([0.123456, -0.000123456], np.float32)}
-    make((("speaker_nonlinearity", bent), ("late_reverb", values | {"taps": np.linspace(-1, 1, 50)}))).save(
+    make((("speaker_nonlinearity", bent), ("late_reverb", values | {"added": np.linspace(-1, 1, 50)}))).save(
         tmp_path / "p.npz"
     )
     assert main(["profile", "show", str(tmp_path / "p.npz")]) == 0
     said = capsys.readouterr().out
-    assert "rt60_s = 0.613" in said and "level_db = -9, taps = 50 values" in said
+    assert "rt60_s = 0.613" in said and "level_db = -9, added = 50 values" in said
     assert "resonance_hz = 235" in said and "force_factor = (0.123, -0.000123)" in said
     assert main(["profile", "show", str(tmp_path / "p.npz"), "--json", "-"]) == 0
     assert json.loads(capsys.readouterr().out)["effects"][1]["parameters"]["rt60_s"] == values["rt60_s"]
