@@ -215,8 +215,8 @@ class Inquiry:
         Each sound is played to each explanation, as fitted, with its noise, and evaluated as what is recorded will be
         (Lindley 1956, "On a measure of the information provided by an experiment"). likely (explanations + 1,): so far;
         less than one in ENOUGH of the best does not stand, but two always do. Of the log odds that the true one gains
-        over each other the mean logarithm counts, 1 added: twice as sure is worth less than another pair told. Raises
-        SignalError where no sound tells those that stand apart.
+        over each other the mean logarithm counts, 1 added: twice as sure is worth less than another pair told. A sound that would
+        not be found again is left out. Raises SignalError where no sound tells those that stand apart.
         """
         likely = likely[: len(self.explanations)]
         standing = max(int(np.count_nonzero(likely * ENOUGH >= likely.max())), 2)
@@ -225,7 +225,10 @@ class Inquiry:
         for words, sound in menu(self.reference).items():
             if progress:
                 progress(f"trying {words}")
-            heard = (prepare(self.profile, _simulated(self.profile, one, sound), sound) for one in asked)
+            try:
+                heard = [prepare(self.profile, _simulated(self.profile, one, sound), sound) for one in asked]
+            except SignalError:  # in what is recorded of it nobody would find it
+                continue
             told = [np.sum([_log_likelihood(h, asked).sum(axis=0) for h in _halves(x)], axis=0) for x in heard]
             gains = [max(float(told[i][i] - told[i][j]), 0.0) for i, j in permutations(range(len(asked)), 2)]
             found.append(Sound(words, sound, float(np.mean(np.log1p(gains)))))

@@ -8,7 +8,6 @@ where the best one does not lead to an explanation.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from itertools import pairwise
 
@@ -39,10 +38,7 @@ def search(
 
 
 def _runs(bench: Workbench, start: EchoModel) -> Iterator[EchoModel]:
-    """What each beginning leads to, until one explains nearly all.
-
-    Then, where that is one long filter, what half of it may lead to.
-    """
+    """What each beginning leads to, until one explains nearly all."""
     criteria = bench.criteria
     known: set[frozenset[str]] = set()
     for first in _starts(bench, start):
@@ -53,8 +49,6 @@ def _runs(bench: Workbench, start: EchoModel) -> Iterator[EchoModel]:
             or bench.left(run) <= (1.0 - criteria.nearly) * bench.left(start)
             or bench.little(run, start)
         ):
-            for simple in _half_of_a_filter(bench, start, run):
-                yield _stepwise(bench, start, simple, known, criteria.long_filter - 1)
             return
 
 
@@ -80,20 +74,8 @@ def _same(bench: Workbench, start: EchoModel, one: Trial, other: Trial) -> bool:
     return all((again := bench.attempt_alike(name, t.model)) is None or again.gain_db < least for t, name in pairs)
 
 
-def _half_of_a_filter(bench: Workbench, start: EchoModel, run: EchoModel) -> list[Trial]:
-    """The simple effect, none or one, that explains a good part of what one long filter does: two of them may look like that filter."""
-    found = added(start, run)
-    if len(found) != 1 or find(found[0]).complexity < bench.criteria.long_filter:
-        return []
-    least = bench.criteria.part * (bench.score(start).level_db - bench.score(run).level_db)
-    simple = [
-        t for t in bench.attempt_all(start, bench.criteria.simple) if t.gain_db >= least and bench.admissible(t, start)
-    ]
-    return sorted(simple, key=lambda t: -t.gain_db)[:1]
-
-
-def _stepwise(bench: Workbench, start: EchoModel, first: Trial, known: set[frozenset[str]], most: int = 9) -> EchoModel:
-    """The model with first and all of complexity up to `most` that can be named beside it.
+def _stepwise(bench: Workbench, start: EchoModel, first: Trial, known: set[frozenset[str]]) -> EchoModel:
+    """The model with first and all that can be named beside it.
 
     known: the sets of effects that earlier runs have held, which those of this one join: where it meets an earlier run, it ends.
     """
@@ -101,7 +83,7 @@ def _stepwise(bench: Workbench, start: EchoModel, first: Trial, known: set[froze
     known.add(frozenset(added(start, model)))
     while len(added(start, model)) < bench.criteria.most_effects and not bench.explained(model):
         bench.so_far(model)
-        newest = forward(bench, model, most)
+        newest = forward(bench, model)
         if newest is None or (held := frozenset(added(start, newest.model))) in known:
             break
         known.add(held)
@@ -120,11 +102,8 @@ def forward(bench: Workbench, model: EchoModel, most: int = 9) -> Trial | None:
     return bench.preferred(t for t in much if bench.admissible(t, model))
 
 
-def refit(bench: Workbench, start: EchoModel, model: EchoModel, goal_db: float = math.inf) -> EchoModel:
-    """Each effect beyond start fitted beside the others, in turn, as long as the held-out level falls and may come below goal_db.
-
-    The fall of a round is less than that of the one before: where that would not reach the goal, no further one does.
-    """
+def refit(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
+    """Each effect beyond start fitted beside the others, in turn, as long as the held-out level falls."""
     listed, worth = added(start, model), bench.criteria.worth_db
     if len(listed) < 2:
         return model
@@ -135,8 +114,7 @@ def refit(bench: Workbench, start: EchoModel, model: EchoModel, goal_db: float =
             again = bench.attempt(name, bench.less(model, name))
             if again is not None and again.score.level_db < bench.score(model).level_db - 0.5 * worth:
                 model = again.model
-        reached = bench.score(model).level_db
-        if before - reached < max(worth, reached - goal_db):
+        if before - bench.score(model).level_db < worth:
             break
         waiting = listed
     return model
@@ -172,14 +150,9 @@ def _exchange(bench: Workbench, start: EchoModel, model: EchoModel, name: str) -
 
 
 def split(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
-    """The model with a simpler effect beside a flexible one where both together explain more than the flexible one alone."""
+    """The model with a simple effect beside each one whose fit has taken that up as well."""
     for name in added(start, model):
         model = _apart(bench, model, name)
-    for name in [name for name in added(start, model) if find(name).flexible]:
-        others = bench.less(model, name)
-        if len(added(start, model)) > 2 or bench.explained(others):
-            break
-        model = _with_simpler(bench, start, model, name)
     return model
 
 
@@ -203,27 +176,6 @@ def _apart(bench: Workbench, model: EchoModel, name: str) -> EchoModel:
         grown = again.model
     lost, left = (bench.score(m).level_db - bench.score(model).level_db for m in (bare, grown))
     return both if left <= (1.0 - bench.criteria.nearly) * lost else model
-
-
-def _with_simpler(bench: Workbench, start: EchoModel, model: EchoModel, name: str) -> EchoModel:
-    """The model with a simpler effect beside the flexible one of that name, of the two that explain most by themselves, or as it is."""
-    criteria, others = bench.criteria, bench.less(model, name)
-    absent = bench.absent(others, max(find(name).complexity - 1, criteria.simple))
-    wanted = [key for key in absent if not (find(key).flexible or find(key).last_resort)]
-    useful = [key for key in wanted if (t := bench.attempt(key, model)) is not None and t.gain_db > 0.0]
-    simple = [
-        t for key in useful if (t := bench.attempt_alike(key, others)) is not None and bench.admissible(t, others)
-    ]
-    least = criteria.part * bench.left(model)
-    for trial in sorted(simple, key=lambda t: -t.gain_db)[:2]:
-        both = bench.attempt(name, trial.model)
-        if both is None or not bench.admissible(both, trial.model):
-            continue
-        joint = refit(bench, start, both.model, bench.score(model).level_db - least)
-        confirmed = bench.beside(trial.name, model, joint)
-        if confirmed.gain_db >= least and bench.admissible(confirmed, bench.less(joint, trial.name)):
-            return joint
-    return model
 
 
 def _best(bench: Workbench, start: EchoModel, runs: list[EchoModel]) -> EchoModel:
