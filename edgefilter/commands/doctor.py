@@ -51,7 +51,7 @@ class Check:
     do: str = ""
 
 
-def judged(name: str, found: str, do: str = "") -> Check:
+def checked(name: str, found: str, do: str = "") -> Check:
     """A finding that is well where nothing is to be done."""
     return Check(name, "warning" if do else "ok", found, do)
 
@@ -82,7 +82,7 @@ def examine(
     """
     cores = len(allowed_cores())
     few = "loudspeaker and room are not learned while running; allow another core"
-    yield judged("cores", str(cores), few if cores < 2 else "")
+    yield checked("cores", str(cores), few if cores < 2 else "")
     yield from _guarded("model", _model())
     yield from _guarded("engine", _engine())
     yield from _guarded("sound server", _server())
@@ -110,7 +110,7 @@ def _model() -> Iterator[Check]:
     found, do = "as shipped", ""
     if not model.shipped:
         found, do = "not the one of this package", "unset EDGEFILTER_CRNN unless you set it on purpose"
-    yield judged("model", f"{model.path}, sha256 {model.sha256[:12]}, {found}", do)
+    yield checked("model", f"{model.path}, sha256 {model.sha256[:12]}, {found}", do)
 
 
 def _engine() -> Iterator[Check]:
@@ -124,18 +124,18 @@ def _engine() -> Iterator[Check]:
     typical = float(np.median(took))
     found = f"{ego.engine_name}, {typical:.1f} ms of computing for a hop of {1000 * ego.hop / SAMPLE_RATE:.0f} ms"
     slow = "'run --engine auto' will take a cheaper one; end other programs"
-    yield judged("engine", found, slow if typical > DEFAULT_MS else "")
+    yield checked("engine", found, slow if typical > DEFAULT_MS else "")
 
 
 def _server() -> Iterator[Check]:
     outputs = pulse.names("output")
     if not outputs:
         help_with = "start PulseAudio or PipeWire (and install pulseaudio-utils), or name an input that records the loudspeaker with --reference"
-        yield judged("sound server", "none answers", help_with)
+        yield checked("sound server", "none answers", help_with)
         return
-    yield judged("sound server", f"{len(outputs)} outputs, default {pulse.default_name('output') or 'none'}")
+    yield checked("sound server", f"{len(outputs)} outputs, default {pulse.default_name('output') or 'none'}")
     made = virtual.SPEAKER in outputs and virtual.HUMAN in outputs
-    yield judged("virtual mic", "there" if made else "not made ('edgefilter devices --load' makes it)")
+    yield checked("virtual mic", "there" if made else "not made ('edgefilter devices --load' makes it)")
 
 
 def _open(
@@ -147,7 +147,7 @@ def _open(
         virtual.refuse_own(device)
     port = input_port(device, channels=channels)
     ports[role] = port
-    yield judged(role, ", ".join([f"{port.device}, {port.rate} Hz", *port.notes]))
+    yield checked(role, ", ".join([f"{port.device}, {port.rate} Hz", *port.notes]))
 
 
 def _sound(ports: dict[str, InputPort]) -> Iterator[Check]:
@@ -157,7 +157,7 @@ def _sound(ports: dict[str, InputPort]) -> Iterator[Check]:
             yield _level(trial)
             yield from array_checks(trial.channels)
         if trial.overruns:
-            yield judged(f"{role} load", f"{trial.overruns} overruns in 3 s", "end other programs")
+            yield checked(f"{role} load", f"{trial.overruns} overruns in 3 s", "end other programs")
 
 
 def array_checks(channels: Sequence[Channel]) -> Iterator[Check]:
@@ -179,7 +179,7 @@ def array_checks(channels: Sequence[Channel]) -> Iterator[Check]:
             why = f"it is a copy of channel {channels[first].number}"
         elif at > first and one.coherence < UNLIKE:
             why = f"it has nothing in common with channel {channels[first].number}: processed, or what is played?"
-        yield judged(f"channel {one.number}", found, f"leave it out of --mic-channels: {why}" if why else "")
+        yield checked(f"channel {one.number}", found, f"leave it out of --mic-channels: {why}" if why else "")
 
 
 def _set_up(
@@ -202,7 +202,7 @@ def _set_up(
     yield from set_up_check(evaluate(each[0], ref), output, str(reference.device))
     yield from array_set_up(microphone.wanted or [0], each, ref, profile)
     if lost:
-        yield judged("set-up load", f"{lost} samples lost while the chirps were heard", "end other programs")
+        yield checked("set-up load", f"{lost} samples lost while the chirps were heard", "end other programs")
 
 
 def array_set_up(numbers: Sequence[int], mics: Samples, ref: Samples, profile: Profile | None) -> Iterator[Check]:
@@ -214,20 +214,20 @@ def array_set_up(numbers: Sequence[int], mics: Samples, ref: Samples, profile: P
     for number, one in zip(numbers, heard):
         if one.same:
             told.add(number)
-            yield judged(f"channel {number}", "it is what is played", "leave it out of --mic-channels")
+            yield checked(f"channel {number}", "it is what is played", "leave it out of --mic-channels")
         elif one.lag_s is not None and abs(late := one.lag_s - middle) > FARTHEST / SAMPLE_RATE:
             told.add(number)
             found = f"it hears the chirps {1000 * late:+.0f} ms beside the others"
-            yield judged(f"channel {number}", found, "leave it out of --mic-channels: it is processed")
+            yield checked(f"channel {number}", found, "leave it out of --mic-channels: it is processed")
     if profile is None or not all(one.in_microphone for one in heard):
         return
     doubts = doubtful_channels(profile, mics, ref)
     for at, what in doubts.items():
         if numbers[at] not in told:
             do = "put --mic-channels into the order in which they were calibrated, mend it, or calibrate again"
-            yield judged(f"channel {numbers[at]}", what, do)
+            yield checked(f"channel {numbers[at]}", what, do)
     if not doubts:
-        yield judged("profile", f"{profile.microphones} microphones as they were calibrated")
+        yield checked("profile", f"{profile.microphones} microphones as they were calibrated")
 
 
 def set_up_check(heard: Heard, output: str, reference: str) -> Iterator[Check]:
@@ -242,27 +242,27 @@ def set_up_check(heard: Heard, output: str, reference: str) -> Iterator[Check]:
         f" clocks {abs(heard.ppm):.0f} ppm apart; linear echo {heard.linear_db:.0f} dB"
     )
     if heard.linear_db >= ENOUGH_DB or heard.linear_db > heard.above_noise_db - 6.0:
-        yield judged("set-up", f"{found}: good")
+        yield checked("set-up", f"{found}: good")
     else:
         do = "turn the loudspeaker down, and end other programs: distortion and unsteady clocks are not predicted"
-        yield judged("set-up", found, do)
+        yield checked("set-up", found, do)
     # what changes the sound on its way: a converter at its end, gain control, noise suppression
     softer = f"chirps {SOFTER_DB:.0f} dB softer come {abs(heard.softer_db):.1f} dB"
     if heard.peak_db > CLIPPED_DB:
-        yield judged("set-up", "the chirps are clipped at the microphone", "lower its gain or the loudspeaker")
+        yield checked("set-up", "the chirps are clipped at the microphone", "lower its gain or the loudspeaker")
     elif heard.softer_db > CHANGED_DB:
         do = "switch gain control off in device or sound server, or turn down the loudspeaker"
-        yield judged("set-up", f"{softer} louder than they should", do)
+        yield checked("set-up", f"{softer} louder than they should", do)
     elif heard.softer_db < -CHANGED_DB:
         do = "switch noise suppression and echo cancelling off in device or sound server"
-        yield judged("set-up", f"{softer} softer than they should", do)
+        yield checked("set-up", f"{softer} softer than they should", do)
 
 
 def _wrong(heard: Heard, output: str, reference: str) -> Check | None:
     """What keeps a run from hearing the robot as it should; None where nothing does."""
     if heard.in_reference and not heard.in_microphone:
         found = f"the reference has the chirps, the microphone does not hear them (its peak: {heard.peak_db:.0f} dB)"
-        return judged("set-up", found, "unmute loudspeaker and microphone, turn them up, or name others")
+        return checked("set-up", found, "unmute loudspeaker and microphone, turn them up, or name others")
     if not heard.in_reference:
         found = f"reference '{reference}' is silent while something is played on output '{output}'"
         do = f"take the monitor of '{output}' (--reference), or play elsewhere (--speaker)"
@@ -285,7 +285,7 @@ def _clock(role: str, trial: Trial) -> Check:
     name = f"{role[:3]} clock"
     found = f"{100 * (trial.pace - 1):+.2f} % of {trial.rate} Hz (to some 0.1 %)"
     if abs(trial.pace - 1) <= PACE:
-        return judged(name, found)
+        return checked(name, found)
     do = f"the {role} loses samples or runs at another rate: end other programs, try another"
     return Check(name, "failed", found, do)
 
@@ -298,4 +298,4 @@ def _level(trial: Trial) -> Check:
         do = "raise the microphone's gain"
     elif trial.peak_db > CLIPPED_DB:
         do = "lower the microphone's gain: it is clipped"
-    return judged("level", found, do)
+    return checked("level", found, do)
