@@ -200,6 +200,15 @@ def test_by_chance_odds_of_twenty_to_one_come_as_seldom_as_they_should() -> None
     assert np.mean(sure) == pytest.approx(0.095, abs=0.02)
 
 
+def test_a_sound_that_would_not_be_found_again_is_not_played() -> None:
+    """Where the clock runs 0.1 % fast and nobody has said so, what is expected of soft sounds is nearly all error."""
+    x = voice(8.0)
+    fast = np.interp(np.arange(x.size) * 0.999, np.arange(x.size), x).astype(np.float32)
+    inquiry = Inquiry(profile(), [("playback_gain",), ("compression",)], record(0.6 * fast), x)
+    worthy = inquiry.sounds(inquiry.before())
+    assert 0 < len(worthy) < len(menu(x)) and worthy[0].expected > 0.0
+
+
 def test_what_predicts_the_same_is_one_explanation_and_an_event_is_none() -> None:
     x = voice(4.0)
     y = record(x, EchoModel(path(seed=2)))
