@@ -10,7 +10,7 @@ import pytest
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.score import Scorer
-from edgefilter.diagnosis.select import _stepwise, refit
+from edgefilter.diagnosis.select import _stepwise
 from edgefilter.diagnosis.trials import Workbench, added
 from edgefilter.dsp.psd import total_power
 from edgefilter.echo.model import EchoModel
@@ -83,23 +83,6 @@ def test_a_gain_behind_the_microphone_is_expected_on_the_fan_as_well():
     score = scorer.of(model)
     assert np.ptp(10 * np.log10(score.cells.mean(axis=1))) < 3.0 and abs(score.over_db) < 0.5
     assert score.level_db < scorer.of(prepared.model).level_db - 2.0
-
-
-def test_a_refit_ends_where_no_round_can_reach_its_goal():
-    x, robot = voice(6.0), profile()
-    changed = robot.echo.with_effect("playback_gain", {"gain_db": -2.0}).with_effect("clock_drift", {"ppm": 40.0})
-    prepared = prepare(robot, record(x, changed), x)
-    bench = Workbench(prepared, Criteria())
-    model = prepared.model
-    for name in ("playback_gain", "clock_drift"):
-        model = bench.attempt(name, model).model
-    tried = []
-    attempt, bench.attempt = bench.attempt, lambda name, model: tried.append(name) or attempt(name, model)
-    refit(bench, prepared.model, model)
-    rounds = len(tried)
-    tried.clear()
-    refit(bench, prepared.model, model, goal_db=bench.score(model).level_db - 50.0)
-    assert len(tried) < rounds
 
 
 @pytest.mark.slow
