@@ -68,14 +68,18 @@ class EchoModel:
 
     def response(self) -> Samples:
         """The impulse response with the effects of stage "response" that hold from the start, (taps,)."""
-        always = [pair for pair in self._by_stage[1] if not pair[0].event]
-        changed = _through(always, np.pad(self.impulse_response, (0, LONGEST)))
-        return changed[: max(self.impulse_response.size, _heard(changed, 1e-6))]
+        return self._response_with([pair for pair in self._by_stage[1] if not pair[0].event], 1e-6)
+
+    def _response_with(self, effects: Chain, share: float) -> Samples:
+        """The impulse response behind effects, up to the last tap that exceeds that share of its largest, (taps,)."""
+        if not effects:
+            return self.impulse_response
+        response = _through(effects, np.pad(self.impulse_response, (0, LONGEST)))
+        return response[: max(self.impulse_response.size, _heard(response, share))]
 
     def over(self, response: Samples) -> EchoModel:
         """The model with this response (taps,) in place of its own."""
-        replaced = {effect.name for effect, _ in self._by_stage[1]}
-        return replace(self._with_those(lambda name, _: name not in replaced), impulse_response=response)
+        return replace(self._with_those(lambda name, _: find(name).stage != "response"), impulse_response=response)
 
     def unpredictable(self, reference: Samples) -> tuple[tuple[Samples, Array], ...]:
         """Of each source of the noise that effects add: its expected square (n,) at the microphone, and its density (601,) per Hz of integral 1."""
@@ -93,10 +97,7 @@ class EchoModel:
         linear = [
             (effect, effect.settled(values)) for effect, values in chain(self.effects) if is_filter(effect, values)
         ]
-        if not linear:
-            return self.impulse_response
-        response = _through(linear, np.pad(self.impulse_response, (0, LONGEST)))
-        return response[: max(self.impulse_response.size, _heard(response, 1e-4))]
+        return self._response_with(linear, 1e-4)
 
     def with_running_response(self, response: Samples, gain: float = 1.0) -> EchoModel:
         """The model whose running_response() begins with response (taps,) and goes on as that of this one times gain.
