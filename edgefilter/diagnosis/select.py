@@ -38,11 +38,12 @@ def search(
 
 
 def _runs(bench: Workbench, start: EchoModel) -> Iterator[EchoModel]:
-    """What each beginning leads to, until one explains nearly all."""
+    """What each beginning leads to, until one explains nearly all: of all its steps, what explains most by effects that can be named."""
     criteria = bench.criteria
     known: set[frozenset[str]] = set()
     for first in _starts(bench, start):
-        run = _stepwise(bench, start, first, known)
+        steps = [standing(bench, start, step) for step in _stepwise(bench, start, first, known)]
+        run = min(steps, key=lambda step: bench.score(step).level_db)
         yield run
         if (
             bench.explained(run)
@@ -68,22 +69,25 @@ def _starts(bench: Workbench, start: EchoModel) -> Iterator[Trial]:
 
 
 def _same(bench: Workbench, start: EchoModel, one: Trial, other: Trial) -> bool:
-    """Whether two effects are two names for the same: beside either of them the other explains next to nothing."""
+    """Whether two effects are two names for the same: as much is left by both, and beside either the other explains next to nothing."""
+    if bench.halves(other, one.model) or bench.halves(one, other.model):
+        return False
     least = bench.criteria.nothing * bench.left(start)
     pairs = ((one, other.name), (other, one.name))
     return all((again := bench.attempt_alike(name, t.model)) is None or again.gain_db < least for t, name in pairs)
 
 
-def _stepwise(bench: Workbench, start: EchoModel, first: Trial, known: set[frozenset[str]]) -> EchoModel:
-    """The model with first and all that can be named beside it.
+def _stepwise(bench: Workbench, start: EchoModel, first: Trial, known: set[frozenset[str]]) -> Iterator[EchoModel]:
+    """The model with first, then step by step with what explains a good part of what is left.
 
     known: the sets of effects that earlier runs have held, which those of this one join: where it meets an earlier run, it ends.
     """
     model = split(bench, start, first.model)
     known.add(frozenset(added(start, model)))
+    yield model
     while len(added(start, model)) < bench.criteria.most_effects and not bench.explained(model):
         bench.so_far(model)
-        newest = forward(bench, model)
+        newest = forward(bench, model) or doubtful(bench, model)
         if newest is None or (held := frozenset(added(start, newest.model))) in known:
             break
         known.add(held)
@@ -91,15 +95,24 @@ def _stepwise(bench: Workbench, start: EchoModel, first: Trial, known: set[froze
         if bench.score(grown).level_db >= bench.score(model).level_db:
             break
         model = grown
+        yield model
         known.add(frozenset(added(start, model)))
-    return model
 
 
 def forward(bench: Workbench, model: EchoModel, most: int = 9) -> Trial | None:
     """The effect to accept next: it explains a good part of what is left, and looks like what it is."""
+    return bench.preferred(t for t in _much(bench, model, most) if bench.admissible(t, model))
+
+
+def doubtful(bench: Workbench, model: EchoModel) -> Trial | None:
+    """The effect to go on with where none looks like what it is: it may not do so before another one is found beside it."""
+    return bench.preferred(t for t in _much(bench, model, 9) if t.p_value <= bench.criteria.false_rate)
+
+
+def _much(bench: Workbench, model: EchoModel, most: int) -> list[Trial]:
+    """Trials that explain a good part of what is left."""
     least = bench.criteria.part * bench.left(model)
-    much = [t for t in bench.attempt_all(model, most) if t.gain_db >= least or bench.halves(t, model)]
-    return bench.preferred(t for t in much if bench.admissible(t, model))
+    return [t for t in bench.attempt_all(model, most) if t.gain_db >= least or bench.halves(t, model)]
 
 
 def refit(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
@@ -152,7 +165,8 @@ def _exchange(bench: Workbench, start: EchoModel, model: EchoModel, name: str) -
 def split(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
     """The model with a simple effect beside each one whose fit has taken that up as well."""
     for name in added(start, model):
-        model = _apart(bench, model, name)
+        apart = _apart(bench, model, name)
+        model = apart if standing(bench, start, apart) is apart else model
     return model
 
 
@@ -179,14 +193,10 @@ def _apart(bench: Workbench, model: EchoModel, name: str) -> EchoModel:
 
 
 def _best(bench: Workbench, start: EchoModel, runs: list[EchoModel]) -> EchoModel:
-    """The run that explains most of those whose effects can all be named.
-
-    The earlier and simpler one where others hardly explain more.
-    """
+    """The run that explains most, or the earlier and simpler one where others hardly explain more."""
     base = bench.score(start).level_db
-    valid = [standing(bench, start, run) for run in runs]
     best = start
-    for run in sorted(valid, key=lambda run: sum(find(name).complexity for name in added(start, run))):
+    for run in sorted(runs, key=lambda run: sum(find(name).complexity for name in added(start, run))):
         most = base - bench.score(run).level_db
         if base - bench.score(best).level_db < bench.criteria.nearly * most:
             best = run
