@@ -24,6 +24,14 @@ def path(seed: int = 1) -> np.ndarray:
     return h.astype(np.float32)
 
 
+def livelier() -> np.ndarray:
+    """(6400,) that path in a room of 0.6 s."""
+    h = path()
+    tail = np.arange(6200)
+    h[200:] += 0.02 * np.random.default_rng(5).standard_normal(tail.size) * np.exp(-6.9 * tail / (0.6 * 16000))
+    return h
+
+
 def profile(h: np.ndarray | None = None) -> Profile:
     """The robot with that path and a white fan."""
     bands = np.array([[900.0, 1100.0]])

@@ -18,7 +18,7 @@ from edgefilter.diagnosis.result import Diagnosis
 from edgefilter.echo.model import EchoModel
 from edgefilter.filter.budget import DEMO
 from tests.as_before import levels_db, same_as_before
-from tests.diagnosis.robot_scene import path, profile, record, voice
+from tests.diagnosis.robot_scene import livelier, path, profile, record, voice
 from tests.diagnosis.test_laws import HIDDEN, lawful
 
 
@@ -71,6 +71,11 @@ def with_effect(name: str, **values: float) -> Callable[[np.ndarray], np.ndarray
     return lambda x: record(x, EchoModel(path()).with_effect(name, values))
 
 
+def drifting_band(x: np.ndarray) -> np.ndarray:
+    effects = {"clock_drift": {"ppm": 80.0}, "bandlimit": {"cutoff_hz": 3300.0}}
+    return record(x, EchoModel(path(), tuple(effects.items())))
+
+
 def scrambled(x: np.ndarray) -> np.ndarray:
     """Only the magnitudes of the voice are heard, 40 ms late, as behind a microphone that makes sound anew."""
     _, _, spectra = signal.stft(np.pad(x, (640, 0))[: x.size], 16000, nperseg=512)
@@ -78,6 +83,7 @@ def scrambled(x: np.ndarray) -> np.ndarray:
     return record(signal.istft(spectra * turned, 16000, nperseg=512)[1][: x.size].astype(np.float32))
 
 
+RING = {"frequency_hz": 900.0, "q": 15.0, "gain_db": 6.0}
 HAPPENED = {
     "trembling": trembling,
     "bent": bent,
@@ -87,6 +93,11 @@ HAPPENED = {
     "clipped": lambda x: np.clip(record(x), -0.03, 0.03),
     "later": lambda x: record(x, lag=37.4),
     "scrambled": scrambled,
+    "turned_down_elsewhere": lambda x: record(0.7 * x, EchoModel(livelier())),
+    "clipped_behind_a_ring": lambda x: np.clip(
+        record(x, EchoModel(path()).with_effect("chassis_resonance", RING)), -0.04, 0.04
+    ),
+    "drifting_band": drifting_band,
     "expanded": lambda x: record((x * np.minimum(np.abs(x) / 0.1, 1.0) ** 0.5).astype(np.float32)),
 }
 
