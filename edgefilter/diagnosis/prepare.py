@@ -165,7 +165,8 @@ def starting_offset(predicted: Samples, recording: Samples) -> float:
     """Samples by which recording (n,) lags behind predicted (n,) at its beginning, both whitened.
 
     Over the whole of it where the lag is constant; where it moves (drift, jumps, a changed path), over the first
-    seconds in which it holds still, so that what happens later is left in the residual. Raises SignalError where no lag
+    seconds in which it holds still, so that what happens later is left in the residual. Where several reflections are
+    about as loud it only seems to move, and these seconds speak for the lag of the whole. Raises SignalError where no lag
     stands out.
     """
     whole, window = find_offset(predicted, recording), SAMPLE_RATE
@@ -181,8 +182,11 @@ def starting_offset(predicted: Samples, recording: Samples) -> float:
     stop = int(starts[moved[0] if moved.size else -1]) + window
     stop = max(min(stop - window // 2, int(starts[0]) + 4 * window), int(starts[0]) + window)
     still = slice(max(int(starts[0]) - window // 2, 0), stop)
-    part, n = delayed(predicted, first)[still], fft.next_fast_len(2 * (still.stop - still.start), real=True)
-    return first + top(likely_cross(part, recording[still], n), n, 0.0)
+    size = still.stop - still.start
+    n, away = fft.next_fast_len(2 * size, real=True), whole - first
+    cross = likely_cross(delayed(predicted, first)[still], recording[still], n)
+    highest_at, _ = highest(correlation_near(cross, n, min(int(abs(away)) + 2, size - 1)))
+    return first + top(cross, n, away if abs(highest_at - away) < 2 else 0.0)
 
 
 def find_offset(predicted: Samples, recording: Samples) -> float:

@@ -11,9 +11,10 @@ import soxr
 from edgefilter.calibration.from_recording import TAIL_S
 from edgefilter.diagnosis.compare import compare
 from edgefilter.diagnosis.prepare import find_talk, prepare
+from edgefilter.echo.model import EchoModel
 from edgefilter.errors import SignalError
 from edgefilter.types import PRE_ROLL
-from tests.diagnosis.robot_scene import DELAY, FAN, profile, record, voice
+from tests.diagnosis.robot_scene import DELAY, FAN, path, profile, record, voice
 
 
 def test_nothing_is_left_of_the_robot_that_was_calibrated() -> None:
@@ -32,6 +33,13 @@ def test_a_constant_lag_is_found_either_way_and_leaves_nothing(lag: float) -> No
     found = compare(profile(), record(x, lag=lag), x)
     assert found.offset_samples == pytest.approx(lag, abs=0.02)  # 0.02 samples leave an error 36 dB below a 4 kHz tone
     assert found.excess_db < 0.5
+
+
+@pytest.mark.parametrize("seed", [2, 3, 4])
+def test_a_reflection_as_loud_as_the_direct_sound_does_not_move_the_lag(seed: int) -> None:
+    x, h = voice(8.0, seed=seed), path()
+    h[PRE_ROLL + 103], h[PRE_ROLL + 136] = h[PRE_ROLL], 0.9 * h[PRE_ROLL]
+    assert prepare(profile(), record(x, EchoModel(h)), x).offset == pytest.approx(0.0, abs=0.1)
 
 
 def test_an_extra_band_of_noise_shows_in_its_band_and_in_the_silence() -> None:
