@@ -49,9 +49,8 @@ class Aligner:
         self.hop = hop
         self._max_lag = int((max_lag_s + 0.1) * SAMPLE_RATE)
         self._latest = self._max_lag + SAMPLE_RATE // 4  # samples from the beginning of an utterance until it is heard
-        further = profile.array.responses if profile and profile.array else ()
-        self._calibrated = None if profile is None else [profile.echo.impulse_response, *further]
-        self._first = FirstSounds(hop, profile.echo.running_response()) if profile else None
+        self._calibrated = None if profile is None else list(profile.running_responses())
+        self._first = FirstSounds(hop, self._calibrated[0]) if self._calibrated else None
         kernel_table()
         self.reset()
 

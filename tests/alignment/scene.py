@@ -32,6 +32,10 @@ class KnownPath:
     echo: EchoModel
     array: KnownArray | None = None
 
+    def running_responses(self) -> np.ndarray:
+        """(microphones, taps)."""
+        return np.stack([self.echo.running_response(), *(self.array.responses if self.array else ())])
+
 
 def speech_like(rng: np.random.Generator, seconds: float) -> np.ndarray:
     """Voiced and unvoiced syllables at 4 a second, peak about 0.3, (n,) float32."""

@@ -11,6 +11,7 @@ from edgefilter.echo.model import EchoModel
 from edgefilter.filter.canceller import Canceller
 from edgefilter.filter.echo_path import EchoPath
 from edgefilter.types import PRE_ROLL
+from tests.diagnosis.robot_scene import profile, record, voice
 from tests.engines.test_engines import robot
 
 
@@ -27,6 +28,19 @@ def db(x):
 def reference():
     noise = signal.lfilter([1], [1, -0.9], np.random.default_rng(5).standard_normal(64_000))
     return (0.05 * noise * (1 + np.sin(np.arange(noise.size) / 900))).astype(np.float32)
+
+
+def test_a_robot_that_stands_elsewhere_is_aligned_by_its_path_of_today():
+    """Whether a loud reflection is an effect of the profile or in its response, the output is the same to the bit."""
+    reference, added = voice(8.0, seed=2), np.zeros(400)
+    added[[PRE_ROLL, PRE_ROLL + 43]] = -0.1, 0.45
+    elsewhere = profile().echo.with_effect("early_path", {"added": added})
+    folded = EchoModel(elsewhere.response())
+    mic = record(reference, folded)
+    by_effect, by_response = (
+        enhance(mic, reference, profile().with_echo(echo), "linear") for echo in (elsewhere, folded)
+    )
+    np.testing.assert_array_equal(by_effect, by_response)
 
 
 def test_an_effect_in_the_profile_lowers_the_residual_of_a_robot_that_has_it(reference):
