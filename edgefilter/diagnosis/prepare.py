@@ -176,7 +176,8 @@ def starting_offset(predicted: Samples, recording: Samples) -> float:
         return whole
     starts, lags = track.starts[clear], whole + track.lag[clear]
     first, middle = float(np.median(lags[:3])), float(np.median(lags))
-    if np.quantile(np.abs(lags - middle), 0.8) < 0.06 and abs(first - middle) < 0.06:
+    spread = float(np.quantile(np.abs(lags - middle), 0.8))
+    if spread < 0.06 and abs(first - middle) < 0.06:
         return whole
     moved = np.flatnonzero(np.abs(lags - first) > 0.3)
     stop = int(starts[moved[0] if moved.size else -1]) + window
@@ -186,7 +187,7 @@ def starting_offset(predicted: Samples, recording: Samples) -> float:
     n, away = fft.next_fast_len(2 * size, real=True), whole - first
     cross = likely_cross(delayed(predicted, first)[still], recording[still], n)
     highest_at, _ = highest(correlation_near(cross, n, min(int(abs(away)) + 2, size - 1)))
-    return first + top(cross, n, away if abs(highest_at - away) < 2 else 0.0)
+    return first + top(cross, n, away if spread > 0.3 and abs(highest_at - away) < 2 else 0.0)
 
 
 def find_offset(predicted: Samples, recording: Samples) -> float:

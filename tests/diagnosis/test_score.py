@@ -93,6 +93,6 @@ def test_a_run_that_meets_an_earlier_one_ends_there():
     bench, start = Workbench(prepared, Criteria()), prepared.model
     known = set()
     for name, others in (("clock_drift", {"playback_gain"}), ("playback_gain", set())):
-        run = _stepwise(bench, start, bench.attempt(name, start), known)
+        *_, run = _stepwise(bench, start, bench.attempt(name, start), known)
         assert set(added(start, run)) == {name} | others
     assert frozenset({"clock_drift", "playback_gain"}) in known
