@@ -164,12 +164,12 @@ def ordinary_distortion(profile: Profile, predicted: Samples) -> tuple[tuple[Sam
 def starting_offset(predicted: Samples, recording: Samples) -> float:
     """Samples by which recording (n,) lags behind predicted (n,) at its beginning, both whitened.
 
-    Over the whole of it where the lag is constant; where it moves (drift, jumps, a changed path), over the first
-    seconds in which it holds still, so that what happens later is left in the residual. Where several reflections are
-    about as loud it only seems to move, and these seconds speak for the lag of the whole. Raises SignalError where no lag
-    stands out.
+    Over the whole of it where the lag is constant; where it moves by more than 0.3 samples (drift, jumps, a changed path),
+    over the first seconds in which it holds still, so that what happens later is left in the residual. Where several
+    reflections are about as loud it only seems to move, and these seconds speak for the lag of the whole. Raises
+    SignalError where no lag stands out.
     """
-    whole, window = find_offset(predicted, recording), SAMPLE_RATE
+    whole, window, moves = find_offset(predicted, recording), SAMPLE_RATE, 0.3
     track = track_lag(delayed(predicted, whole), recording, None, window, TRACK_REACH)
     clear = track.correlation > 0.5 * track.correlation.max(initial=0.0)
     if np.count_nonzero(clear) < 4:
@@ -179,7 +179,7 @@ def starting_offset(predicted: Samples, recording: Samples) -> float:
     spread = float(np.quantile(np.abs(lags - middle), 0.8))
     if spread < 0.06 and abs(first - middle) < 0.06:
         return whole
-    moved = np.flatnonzero(np.abs(lags - first) > 0.3)
+    moved = np.flatnonzero(np.abs(lags - first) > moves)
     stop = int(starts[moved[0] if moved.size else -1]) + window
     stop = max(min(stop - window // 2, int(starts[0]) + 4 * window), int(starts[0]) + window)
     still = slice(max(int(starts[0]) - window // 2, 0), stop)
@@ -187,7 +187,7 @@ def starting_offset(predicted: Samples, recording: Samples) -> float:
     n, away = fft.next_fast_len(2 * size, real=True), whole - first
     cross = likely_cross(delayed(predicted, first)[still], recording[still], n)
     highest_at, _ = highest(correlation_near(cross, n, min(int(abs(away)) + 2, size - 1)))
-    return first + top(cross, n, away if spread > 0.3 and abs(highest_at - away) < 2 else 0.0)
+    return first + top(cross, n, away if spread > moves and abs(highest_at - away) < 2 else 0.0)
 
 
 def find_offset(predicted: Samples, recording: Samples) -> float:

@@ -166,7 +166,8 @@ def split(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
     """The model with a simple effect beside each one whose fit has taken that up as well."""
     for name in added(start, model):
         apart = _apart(bench, model, name)
-        model = apart if standing(bench, start, apart) is apart else model
+        if apart is not model and standing(bench, start, apart) is apart:
+            model = apart
     return model
 
 
