@@ -154,8 +154,9 @@ def every(sets: dict[str, list[Item]], n: int = 1, limit: int | None = None) -> 
 
 
 def progress(items: Sequence[Item], unit: str = "recording", name: str | None = None) -> Iterable[Item]:
-    """The items, with a bar where somebody is looking."""
-    return tqdm(items, unit=unit, desc=name, disable=not sys.stderr.isatty())
+    """The items, with a bar; in a log it is written once a minute."""
+    seconds = 0.1 if sys.stderr.isatty() else 60.0
+    return tqdm(items, unit=unit, desc=name, delay=seconds, mininterval=seconds, maxinterval=max(seconds, 10.0))
 
 
 # ---------------------------------------------------------------- real devices

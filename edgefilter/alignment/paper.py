@@ -115,6 +115,6 @@ class PaperAligner:
         self._scanned += STRIDE
         if self._best > DECISIVE or self._scanned >= self._max_lag:
             if self._best > CREDIBLE:
-                self._delay, self._confidence = self._best_lag, min(self._best, 1.0)
+                self._delay, self._confidence = self._best_lag, self._best
                 self._decided += 1
             self._begin(None)

@@ -121,6 +121,13 @@ def test_clocks_that_drift_are_told_and_straightened(passport, clean):
     assert any("clocks" in change for change in figures["said"]["changes"])
 
 
+def test_a_lag_that_jumps_is_told_with_how_far(clean):
+    said, heard = clean
+    middle, moved = said.size // 2, 240
+    found = measure(np.concatenate((heard[:middle], heard[middle - moved : -moved])), said, said[:RATE], engines=[])
+    assert found.lag_spread_ms == pytest.approx(1000 * moved / RATE, abs=0.3) and found.sharp == 1.0
+
+
 @pytest.mark.slow
 def test_a_microphone_that_is_overdriven_is_named_where_that_is_what_bounds_the_filter(clean):
     said, heard = clean

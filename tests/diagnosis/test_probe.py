@@ -217,6 +217,11 @@ def test_what_predicts_the_same_is_one_explanation_and_an_event_is_none() -> Non
         Inquiry(profile(), [("delay_jump",), ("playback_gain",)], y, x)
 
 
+def test_what_differs_only_by_what_the_fan_taught_is_one_explanation() -> None:
+    x = voice(4.0)
+    assert len(Inquiry(profile(), VOLUME_OR_RING, record(x, seed=1), x).explanations) == 1
+
+
 def test_a_louder_fan_that_the_profile_knows_is_expected_once() -> None:
     """A profile with a fan 6 dB louder as an effect says the same as one that was calibrated beside that fan."""
     x, calibrated = voice(4.0), profile()

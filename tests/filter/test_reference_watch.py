@@ -178,6 +178,13 @@ def test_a_reference_is_missing_after_a_minute_in_which_ten_seconds_were_louder_
     assert watched(*((*part, "idle") for part in parts)) == ([("reference_missing", at)] if at else [])
 
 
+def test_a_reference_that_has_come_once_is_not_missing_however_long_it_is_silent_then():
+    watch, hop = ReferenceWatch(1600), np.full(1600, 0.01, np.float32)
+    aligned = Aligned(hop, float("nan"), 0.0, 0.0, "idle", False)
+    said = [watch.step(hop, hop if number == 5 else 0 * hop, aligned, None) for number in range(900)]
+    assert "reference_missing" not in {kind for found in said for kind, _ in found}
+
+
 @pytest.mark.parametrize(
     ("quiet_s", "unfound_s", "louder_db", "said"),
     [(1.0, 5.1, 10.1, True), (0.9, 5.1, 10.1, False), (1.0, 4.9, 10.1, False), (1.0, 5.1, 9.9, False)],

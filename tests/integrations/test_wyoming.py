@@ -126,6 +126,9 @@ def test_commands_are_microphone_and_loudspeaker_and_who_hangs_up_interrupts(end
             listener, speaker = await connect("microphone"), await connect("loudspeaker")
             chunk = AudioChunk.from_event(await listener.read_event())
             assert (chunk.rate, chunk.width, chunk.channels) == (RATE, 2, 1) and from_pcm16(chunk.audio).any()
+            await listener.write_event(Describe().event())
+            kinds = [(await listener.read_event()).type for _ in range(30)]
+            assert kinds.count("info") == 1 and kinds[-1] == "audio-chunk"  # whoever has asked hears on
             await speaker.write_event(Describe().event())
             assert Info.from_event(await speaker.read_event()).snd[0].snd_format == MONO
             await speaker.write_event(AudioStart(RATE, 2, 1).event())
