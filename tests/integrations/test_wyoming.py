@@ -24,7 +24,7 @@ from wyoming.server import AsyncEventHandler, AsyncServer
 from wyoming.snd import Played
 
 from edgefilter import EgoFilter
-from edgefilter.integrations.duplex import as_pcm16, from_pcm16
+from edgefilter.integrations.duplex import MOST_QUEUED_S, as_pcm16, from_pcm16
 from edgefilter.integrations.wyoming import EgoService, Player, main
 
 RATE = 16_000
@@ -204,13 +204,16 @@ def test_who_sends_a_broken_chunk_is_disconnected_in_one_line_and_others_go_on(b
 
 
 @pytest.mark.parametrize("end", ["microphone", "loudspeaker"])
+@pytest.mark.parametrize(
+    "claimed", [900_000_000, 2 * round(MOST_QUEUED_S * RATE) + 1], ids=["900 MB", "more than waits"]
+)
 @pytest.mark.parametrize("what", ["payload_length", "data_length"])
-def test_a_message_that_claims_900_mb_is_refused_before_it_is_read(end, what, endless_noise, player, caplog):
+def test_a_message_that_claims_too_much_is_refused_before_it_is_read(end, what, claimed, endless_noise, player, caplog):
     async def talk():
         async with running(endless_noise, player) as (service, connect, ports):
             await (await connect(end)).disconnect()  # the service has started
             reader, writer = await asyncio.open_connection("127.0.0.1", ports[end])
-            writer.write(json.dumps({"type": "audio-chunk", what: 900_000_000}).encode() + b"\n" + bytes(100_000))
+            writer.write(json.dumps({"type": "audio-chunk", what: claimed}).encode() + b"\n" + bytes(100_000))
             with contextlib.suppress(ConnectionError):
                 while await asyncio.wait_for(reader.read(65536), 5):  # what the microphone has said meanwhile
                     pass
@@ -219,7 +222,7 @@ def test_a_message_that_claims_900_mb_is_refused_before_it_is_read(end, what, en
 
     within_a_minute(talk)
     told = logged(caplog)
-    assert len(told) == 1 and "900000000 bytes" in told[0] and "connection is closed" in told[0], told
+    assert len(told) == 1 and f"{claimed} bytes" in told[0] and "connection is closed" in told[0], told
 
 
 def test_a_client_that_speaks_another_language_is_disconnected(endless_noise, player, caplog):
