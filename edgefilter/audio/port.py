@@ -123,7 +123,7 @@ class Port:
                 except (self._sd.PortAudioError, ValueError) as error:
                     refusal = refusal or _words(error)
         rates = f"{SAMPLE_RATE} Hz or {self.device.rate:.0f} Hz"
-        raise DeviceError(f"{self._name} cannot be opened at {rates}: {refusal}")
+        raise DeviceError(f"{self._name} cannot be opened at {rates}: {refusal}; choose another ('edgefilter devices')")
 
     def start(self, callback: Any) -> None:
         """Open the stream with this callback; raises DeviceError."""
