@@ -12,7 +12,7 @@ from typing import BinaryIO
 from edgefilter.echo.user_effects import load_effect
 from edgefilter.filter.echo_path import Lesson
 from edgefilter.filter.timing import peak_memory_mb
-from edgefilter.learning.background import LENGTH, Beginning, News
+from edgefilter.learning.background import LENGTH, TOGETHER, Beginning, News
 from edgefilter.learning.path_learner import PathLearner
 
 
@@ -53,7 +53,7 @@ def learn(answers: BinaryIO) -> None:
             continue
         lesson = learner.observe(message)
         hops += 1
-        if lesson or hops % 16 == 0:  # of itself each quarter of a second
+        if lesson or hops % TOGETHER == 0:
             tell(lesson)
     learner.close()
     tell()
