@@ -160,8 +160,8 @@ def live(minutes: float, engine: str) -> dict:
             raise UsageError(f"edgefilter run failed: {process.stderr.read()}")
         stats = json.loads((folder / "stats.json").read_text())
     found = {key: stats[key] for key in ("engine", "samples_in", "samples_out", "source", "deadline")}
-    learner_cpu_s = stats["learning"]["cpu_s"] / minutes
-    return {**found, "learner_cpu_s_a_minute": learner_cpu_s, "lost": stats["samples_lost"], "slices": slices}
+    learner_cpu_s = (stats["learning"] or {}).get("cpu_s", 0.0)  # with one core nothing is learned
+    return {**found, "learner_cpu_s_a_minute": learner_cpu_s / minutes, "lost": stats["samples_lost"], "slices": slices}
 
 
 def _play(server: virtual_sound.Server, sink: str, sound: Path, seconds: float, folder: Path) -> subprocess.Popen:

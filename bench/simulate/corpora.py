@@ -37,8 +37,8 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 import soundfile as sf
 import soxr
-from tqdm import tqdm
 
+from bench.recordings import progress
 from bench.results import digest
 from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.types import SAMPLE_RATE
@@ -288,7 +288,7 @@ def synthesizers(output: Path) -> Sums:
 def _render(sentences: Sequence[Sentence], render: Renderer, folder: Path) -> dict[str, object]:
     """Write sentences as 16 kHz FLAC below the folder, and their transcripts."""
     rows = []
-    for sentence in tqdm(sentences, desc=folder.name, unit="sentence", disable=not sys.stderr.isatty()):
+    for sentence in progress(sentences, "sentence", folder.name):
         samples, rate = render(sentence)
         samples = np.asarray(samples, np.float32)
         if rate != SAMPLE_RATE:
