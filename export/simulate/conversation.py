@@ -26,6 +26,10 @@ from export.simulate.recipe import BENCHMARK, Recipe
 
 LOUDEST = 0.95
 """Largest sample that a microphone which does not clip is given."""
+KEPT = ("effects", "effects_share", "later", "other_voices")
+"""What of a recipe also holds for its plain items."""
+MOTORS_DB = (-28.0, -4.0)
+"""Motors over the robot's voice at the microphone: servos beside it are about as loud as a human some metres away."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +53,13 @@ class Conversation:
 
 @dataclass(frozen=True, eq=False)
 class Voice:
-    """The robot's at the microphone: echo (n,), reference (n,), the echo path (taps,) behind the player; what it is about."""
+    """The robot's at the microphone: echo (n,), reference (n,), the echo path (taps,) behind the player; what it is about.
+
+    played: (n,) by the player.
+    """
 
     echo: Samples
+    played: Samples
     reference: Samples
     path: Samples
     about: dict[str, object]
@@ -61,7 +69,7 @@ def simulate(recipe: Recipe, seed: int, index: int, material: Material) -> Conve
     """Item `index` of that seed."""
     rng = np.random.default_rng([seed, index])
     if rng.random() < recipe.plain:
-        kept = {name: getattr(recipe, name) for name in ("effects", "effects_share", "later", "other_voices")}
+        kept = {name: getattr(recipe, name) for name in KEPT}
         recipe = replace(BENCHMARK, **kept)
     before = round(recipe.seconds * SAMPLE_RATE) if rng.random() < recipe.later else 0
     recipe = replace(recipe, seconds=recipe.seconds + before / SAMPLE_RATE)
@@ -78,6 +86,11 @@ def simulate(recipe: Recipe, seed: int, index: int, material: Material) -> Conve
     quiet = rng.random() < recipe.quiet_fan
     fan_rms = human_rms * 10 ** (-(rng.uniform(20, 45) if quiet else rng.uniform(*recipe.fan_db)) / 20)
     noise, psd = fan.noise(rng, material, samples, fan_rms, human_rms, recipe.wideness)
+    moves, hums = rng.random(2) < (recipe.motors, recipe.hum)
+    if moves:
+        noise = noise + fan.motors(rng, material, voice.played, level * 10 ** (rng.uniform(*MOTORS_DB) / 20))
+    if hums:
+        noise = noise + fan.hum(rng, samples)
     microphone = Microphone.draw(rng, recipe.wideness, recipe.seconds, recipe.processed)
     mic, clean, heard_fan, gain = _recorded(microphone, robot_gain * voice.echo, clean, noise)
     profile, known = _profile(rng, recipe, material, (room, colour), microphone, gain, (robot_gain, voice.path), psd)
@@ -90,6 +103,8 @@ def simulate(recipe: Recipe, seed: int, index: int, material: Material) -> Conve
         "human_over_robot_db": round(20 * float(np.log10(human_rms / level)), 1),
         "quiet_fan": bool(quiet),
         "learned": bool(before),
+        "motors": bool(moves),
+        "hum": bool(hums),
         "processed": microphone.suppression is not None,
     }
     return Conversation(
@@ -114,13 +129,17 @@ def _robot(
     level_db, ppm = rng.uniform(*recipe.distortion_db), rng.uniform(*recipe.ppm)
     about = {"moving": bool(moving), "utterances": said.utterances, "effects": [name for name, _ in effects]}
     if silent:
-        return Voice(np.zeros(samples, np.float32), np.zeros(samples, np.float32), response, about)
+        return Voice(*np.zeros((3, samples), np.float32), response, about)
     sound = distorted(rng, said.played, recipe.kinds, level_db)
     echo = EchoModel(response, effects).predict(sound)[PRE_ROLL:]
     echo = np.concatenate((echo, np.zeros(PRE_ROLL, np.float32)))
     if moving:
         echo = ClockDrift().apply(echo, {"ppm": ppm, "offset": 0.0}, SAMPLE_RATE)
-    return Voice(echo, said.told, response, about | {"distortion_db": round(level_db, 1)})
+    told = said.told
+    if breaks := rng.random() < recipe.broken:
+        told = script.broken(rng, recipe, material.robots, told)
+    about |= {"distortion_db": round(level_db, 1), "broken": breaks}
+    return Voice(echo, said.played, told, response, about)
 
 
 def _recorded(

@@ -55,6 +55,30 @@ def fan(rng: np.random.Generator, samples: int, rms: float) -> tuple[Samples, Sa
     return (scale * sound).astype(np.float32), (2 / SAMPLE_RATE * (scale * response) ** 2).astype(np.float32)
 
 
+def motors(rng: np.random.Generator, material: Material, played: Samples, rms: float) -> Samples:
+    """Noise of servos (n,) that move with the voice played (n,), of that RMS where they are loudest; no reference holds it."""
+    sound = material.noise(rng, played.size)
+    if sound is None or rng.random() < 0.5:
+        sound = fan(rng, played.size, 1.0)[0]
+    width = int(rng.uniform(0.1, 0.6) * SAMPLE_RATE)  # a gesture outlasts its syllable
+    loud = signal.oaconvolve(np.abs(played), np.ones(width, np.float32) / width)
+    delay = int(rng.integers(width))
+    loud = loud[delay : delay + played.size]
+    moving = np.clip(loud / max(float(np.quantile(loud, 0.9)), 1e-9), 0.0, 1.0) ** rng.uniform(0.3, 1.5)
+    return (rms / max(active_rms(sound), 1e-9) * moving * sound).astype(np.float32)
+
+
+def hum(rng: np.random.Generator, samples: int) -> Samples:
+    """A constant offset of -60 to -28 dB of full scale, and mains hum (n,) with up to four harmonics."""
+    seconds = np.arange(samples) / SAMPLE_RATE
+    total = np.full(samples, rng.choice((-1.0, 1.0)) * 10 ** (rng.uniform(-60, -28) / 20))
+    mains, level_db = rng.choice((50.0, 60.0)) * rng.uniform(0.998, 1.002), rng.uniform(-60, -26)
+    for harmonic in range(1, int(rng.integers(2, 6))):
+        size = 10 ** ((level_db - rng.uniform(0, 6) * harmonic) / 20)
+        total += size * np.sin(2 * np.pi * (harmonic * mains * seconds + rng.random()))
+    return total.astype(np.float32)
+
+
 def _speed(rng: np.random.Generator, samples: int) -> Samples:
     """Gain of a fan that is turned up or down by as much as 8 dB within 0.3 to 4 s, (n,)."""
     at, lasts = rng.uniform(0.1, 0.8) * samples, rng.uniform(0.3, 4.0) * SAMPLE_RATE

@@ -24,7 +24,9 @@ class Recipe:
     clock and volume change. far_human: the far end is a person instead of a voice from text. other_voices: of robots and of
     humans, whose voice is played faster or slower and so is another's. plain: drawn by the recipe BENCHMARK instead.
 
-    processed: the device suppresses noise before anybody hears the microphone.
+    processed: the device suppresses noise before anybody hears the microphone. motors: the robot moves while it talks, with
+    a noise that follows its voice. broken: the reference stops, lacks samples or is another recording's. hum: a constant offset and mains hum
+    at the microphone.
 
     later: the filter has run for as long as the item already, and has learned meanwhile as it does in use.
 
@@ -63,6 +65,9 @@ class Recipe:
     catalogue: float = 0.0
     later: float = 0.0
     processed: float = 0.0
+    motors: float = 0.0
+    broken: float = 0.0
+    hum: float = 0.0
     setting: Setting = BenchSetting()
     plain: float = 0.0
 
@@ -112,6 +117,8 @@ VOICES = replace(MICROPHONE, other_voices=0.5)
 """MICROPHONE with more voices than there are: of synthetic ones few are at hand, and robots have any."""
 DEVICES = replace(VOICES, processed=0.2, later=0.03, setting=WideSetting(lost=0.1, displaced_s=0.06))
 """VOICES with devices on which no linear stage helps: what is left is the reference's magnitudes, about aligned."""
+FIELD = replace(DEVICES, motors=0.2, broken=0.08, hum=0.1, distortion_db=(-45.0, -5.0), plain=0.2)
+"""DEVICES with robots that move while they talk, references that break, cheap microphones and louder distortion."""
 RECIPES = {
     "edge": BENCHMARK,
     "paper": PAPER,
@@ -119,4 +126,5 @@ RECIPES = {
     "microphone": MICROPHONE,
     "voices": VOICES,
     "devices": DEVICES,
+    "field": FIELD,
 }
