@@ -70,7 +70,9 @@ class Output(NamedTuple):
 
 _Speech: TypeAlias = Literal["speech_started", "speech_stopped"]
 _Filter: TypeAlias = Literal["realigned", "overloaded", "stepped_down", "stepped_up", "learned", "unlearned"]
-_SetUp: TypeAlias = Literal["reference_missing", "reference_late", "robot_unfound", "echo_unpredicted", "rate_mismatch"]
+_SetUp: TypeAlias = Literal[
+    "reference_missing", "reference_late", "robot_unfound", "echo_unpredicted", "same_signal", "rate_mismatch"
+]
 _Device: TypeAlias = Literal["lost", "overrun", "underrun", "device_gone", "device_back"]
 EventKind: TypeAlias = Literal[_Speech, _Filter, _SetUp, _Device]
 
@@ -99,9 +101,10 @@ class Event:
         What happened. "realigned": the reference was found elsewhere in the microphone. "speech_started",
         "speech_stopped": of the human, from engines that judge it. "overloaded", "stepped_down", "stepped_up": what too
         little or enough time led to. "learned", "unlearned": a better echo path was taken over, or given back.
-        "reference_missing", "reference_late", "robot_unfound": the reference was silent from the start, comes after its
-        echo, or carries sound that is not found in the microphone, though that is louder then. "echo_unpredicted": the
-        echo is found, and hardly any of it can be subtracted. "rate_mismatch": a plugin's or a service's sound comes at
+        "reference_missing", "reference_late", "robot_unfound": the reference was silent from the start or fell silent while
+        the robot is heard, comes after its echo, or carries sound that is not found in the microphone, though that is
+        louder then. "echo_unpredicted": the echo is found, and hardly any of it can be subtracted. "same_signal": the
+        microphone is the reference. "rate_mismatch": a plugin's or a service's sound comes at
         another pace than its rate and channels say. Only from `edgefilter run`: "lost", "overrun", "underrun" (samples
         that the sound devices lost, callbacks that came too late), "device_gone", "device_back" (a device stopped, so
         that silence stands in for it, and runs again).
@@ -151,11 +154,10 @@ class AlignmentStats(AlignmentCounts, total=False):
     utterances_aligned: int
 
 
-class LinearStageStats(TypedDict):
+class CancellerStats(TypedDict):
     """What the canceller did: hops, those in which it adapted, its length in hops, the playback gain that it follows.
 
-    diverged: how often it began anew because what it predicted was beyond all reason. removed_db: how far the subtraction
-    has lowered the robot over its last ten seconds, None before three of them.
+    diverged: how often it began anew because what it predicted was beyond all reason.
     """
 
     hops: int
@@ -163,6 +165,11 @@ class LinearStageStats(TypedDict):
     partitions: int
     gain_db: float
     diverged: int
+
+
+class LinearStageStats(CancellerStats):
+    """What the linear stage did. removed_db: by how much it lowers the robot now, dB, by the last 5 s of robot; None before 3 s."""
+
     removed_db: float | None
 
 

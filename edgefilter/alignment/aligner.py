@@ -350,7 +350,7 @@ class Aligner:
         if abs(start - self._read_at) > 0.5:
             start, switched = self._read_at - self._drift.slope * self.hop, True
         reference = read_delayed(self._ref, end, self.hop, start, self._read_at)
-        if self._open and not self._refuted and end - self._drift.delay > self._open[0].start:
+        if self._known and self._open and not self._refuted and end - self._drift.delay > self._open[0].start:
             self._refuted = self._cannot_be(mic)
         if self._refuted:
             reference = np.zeros(self.hop, np.float32)

@@ -8,7 +8,7 @@ import numpy as np
 
 from edgefilter.dsp import fourier
 from edgefilter.dsp.membrane import LOWEST_HZ
-from edgefilter.dsp.psd import hann
+from edgefilter.dsp.psd import hann, mel_edges
 from edgefilter.types import SAMPLE_RATE, Samples
 
 BANDS = 40
@@ -48,10 +48,7 @@ class CoarseLag:
     def __init__(self, hop: int, max_lag: int) -> None:
         self._hop = hop
         self._window = hann(2 * hop).astype(np.float32)
-        lowest, highest = (2595.0 * math.log10(1.0 + hz / 700.0) for hz in (LOWEST_HZ, SAMPLE_RATE / 2))
-        mel = np.linspace(lowest, highest, BANDS + 1)
-        edges = 700.0 * (10.0 ** (mel / 2595.0) - 1.0) * 2 * hop / SAMPLE_RATE
-        self._edges = np.unique(np.round(edges).astype(int))[:-1]
+        self._edges = mel_edges(hop + 1, BANDS, LOWEST_HZ)
         self._sound = np.zeros((2, 2 * hop), np.float32)
         self._forget = math.exp(-hop / (MEMORY_S * SAMPLE_RATE))
         lags = max_lag // hop + 1

@@ -66,3 +66,13 @@ def third_octave_bands() -> Array:
     centres = 1000.0 * 10 ** (np.arange(-13, 10) / 10)
     edges = np.stack((centres * 10**-0.05, centres * 10**0.05), axis=1)
     return np.minimum(edges, SAMPLE_RATE / 2)
+
+
+def mel_edges(bins: int, bands: int, lowest_hz: float) -> np.ndarray:
+    """First bins (at most bands,) of bands as wide as the ear's, from lowest_hz to 8 kHz, of a spectrum (bins,).
+
+    The mel scale of O'Shaughnessy (1987), 2595 lg(1 + f / 700 Hz). For np.add.reduceat.
+    """
+    lowest, highest = (2595.0 * np.log10(1.0 + hz / 700.0) for hz in (lowest_hz, SAMPLE_RATE / 2))
+    hz = 700.0 * (10.0 ** (np.linspace(lowest, highest, bands + 1) / 2595.0) - 1.0)
+    return np.unique(np.round(hz * 2 * (bins - 1) / SAMPLE_RATE).astype(int))[:-1]

@@ -13,7 +13,7 @@ from edgefilter.dsp import fourier
 from edgefilter.dsp.membrane import DISPLACEMENT_TAPS, displacement_taps
 from edgefilter.errors import SignalError
 from edgefilter.filter.volume import EchoLimiter, Volume
-from edgefilter.types import LOUDEST, SAMPLE_RATE, LinearStageStats, Samples, Spectrum
+from edgefilter.types import LOUDEST, SAMPLE_RATE, CancellerStats, Samples, Spectrum
 
 PRIOR_VARIANCE = 0.05
 """Variance of a calibrated path relative to its own power: the robot moved and the room is another."""
@@ -21,6 +21,10 @@ UNKNOWN_VARIANCE = 0.1
 """Variance of an unknown path, summed over its partitions, relative to the power of microphone over reference in each bin
 when it is first adapted: on 63 simulated and real recordings without a profile .1 and .3 leave the same within 0.2 dB, .03
 learns too slowly by up to 10 dB, 1 and more forgets within hops."""
+BOOST = 100.0
+"""Most by which an unknown path is expected to pass one frequency better than it passes the pre-emphasised voice as a whole,
+20 dB. More than that was not played: hum, rumble. Of a hum as loud as the robot 7 of 11 dB of harm are left. With 30 to
+1000 each of 22 real recordings, tuned on, keeps within 1 dB of the robot; at 1000 hum does twice the harm."""
 UNKNOWN_HOPS = 32
 """Hops of robot, half a second, for which an unknown path stays as uncertain as what is heard makes it: what the first
 hop says, before the echo has arrived or while the voice only begins, may be wrong by any factor."""
@@ -178,6 +182,7 @@ class Canceller:
             self._expect(power.sum(axis=-2), late, np.float32(PRIOR_VARIANCE) * power)
         self._ageing, self._aged = (1.0 - self.adaptation.transition**2) * fourier.power(self._weights), 0
         self._noise = np.zeros((*lead, bins), np.float32)
+        self._before, self._silent = np.zeros((*lead, bins), np.float32), True
         self._work = np.zeros(shape, np.complex64)
         self._expected = np.zeros(shape, np.float32)
         self._padded = np.zeros((*lead, 2 * hop), np.float32)
@@ -215,7 +220,11 @@ class Canceller:
         self._noise += (1.0 - memory) * fourier.power(error_spectrum)
         self._hops += 1
         played = self._recent[0, self.hop :]  # the reference, or nothing where it has just begun anew
-        heard = located and played.dot(played) > FLOOR * self.hop
+        talks = played.dot(played) > FLOOR * self.hop
+        if self._silent and not talks:
+            self._before = self._noise.copy()
+        self._silent = self._silent and not talks
+        heard = located and talks
         if heard and self._unknown:
             self._unknown -= 1
             self._expect_what_is_heard()
@@ -318,7 +327,11 @@ class Canceller:
         decay = self._decay()
         played = np.add.reduce(self._powers[: self.partitions], axis=0) / self.partitions
         heard = 2.0 * self._noise  # half of each block is the microphone, and nothing was subtracted from it yet
-        self._expect(heard / (played + fourier.TINY), UNKNOWN_VARIANCE / decay.sum() * decay)
+        emphasis = np.square(np.arange(self.hop + 1, dtype=np.float32))
+        added = 2.0 * np.maximum(self._noise - self._before, 0.0)
+        whole = np.add.reduce(emphasis * added, axis=-1) / (np.add.reduce(emphasis * played) + fourier.TINY)
+        path_power = np.minimum(heard / (played + fourier.TINY), BOOST * whole[..., None])
+        self._expect(path_power, UNKNOWN_VARIANCE / decay.sum() * decay)
 
     def _decay(self) -> Samples:
         """Power of a room's response, from 1 on, (partitions, 1)."""
@@ -377,7 +390,7 @@ class Canceller:
         self._powers[:] = fourier.power(self._spectra)
         self._recent[:] = [channel[-2 * self.hop :] for channel in channels]
 
-    def stats(self) -> LinearStageStats:
+    def stats(self) -> CancellerStats:
         """What the stage did so far."""
         return {
             "hops": self._hops,
@@ -385,5 +398,4 @@ class Canceller:
             "partitions": self.partitions,
             "gain_db": 20.0 * float(np.log10(self.volume.gain)),
             "diverged": self._diverged,
-            "removed_db": self.volume.removed_db,
         }

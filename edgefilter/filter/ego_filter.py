@@ -284,7 +284,7 @@ class EgoFilter:
             "latency_ms": None if self.waits_for_end else 1000 * self.latency / SAMPLE_RATE,
             "samples": self._stream.samples_in,
             "alignment": front.aligner.stats() if front.aligner else None,
-            "linear_stage": front.linear_stage.canceller.stats() if front.linear_stage else None,
+            "linear_stage": front.linear_stage.stats() if front.linear_stage else None,
             "array": front.microphones.stats() if front.microphones else None,
             "learning": self._stream.learner.stats() if self._stream.learner and front.linear_stage else None,
             "deadline": self._stream.stepping.stats() if self._stream.stepping else None,

@@ -14,19 +14,40 @@ from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.filter.canceller import Canceller, CancellerOutput
 from edgefilter.filter.echo_path import PAST, EchoPath, FilteredHop, Learner, Lesson, starting_path
 from edgefilter.filter.microphones import Microphones
+from edgefilter.filter.removal import Removal
 from edgefilter.filter.residual_echo import Residual, Unpredictable
 from edgefilter.filter.spatial import SpatialFilter
 from edgefilter.profile.data import Profile
-from edgefilter.types import Frame, Output, Samples, Spectrum
+from edgefilter.types import SAMPLE_RATE, Frame, LinearStageStats, Output, Samples, Spectrum
 
 RUMBLE_HZ, RUMBLE = 90.0, 0.05
 """Below this frequency a microphone without a calibration picks up the room, not people; it is lowered by 26 dB."""
+OFFSET_S = 0.5
+"""Time constant, seconds, with which a constant offset of the microphone is followed: at 60 Hz it turns the phase by 0.3 degrees."""
+
+
+class Centred:
+    """Takes a constant offset off a signal, hop by hop: its running mean at first, later what the last OFFSET_S had."""
+
+    def __init__(self, hop: int) -> None:
+        self._follow = hop / (OFFSET_S * SAMPLE_RATE)
+        self._ramp = np.arange(1, hop + 1, dtype=np.float32) / np.float32(hop)
+        self._hops = 0
+        self._offset = np.zeros(1, np.float32)
+
+    def step(self, x: Samples) -> Samples:
+        """The next hop x (..., hop) without its offset."""
+        mean, self._hops = x.mean(axis=-1, keepdims=True), self._hops + 1
+        before = self._offset if self._hops > 1 else mean
+        self._offset = before + np.float32(max(self._follow, 1.0 / self._hops)) * (mean - before)
+        return x - (before + (self._offset - before) * self._ramp)
 
 
 class LinearStage:
     """Tracked delay, echo path and residual echo: what only front ends of the kind "full" have.
 
     learner: told of every hop; the lesson that it answers is adopted with the next one. lesson: adopted in the latest hop.
+    removal: how much of the robot is removed.
     """
 
     lesson: Lesson | None = None
@@ -37,6 +58,7 @@ class LinearStage:
         self.aligner = aligner
         self.path = path
         self.residual = residual
+        self.removal = Removal(aligner.hop)
         self._learner = learner
         self._fade = np.linspace(0.0, 1.0, aligner.hop, dtype=np.float32)
         if learner:
@@ -59,6 +81,10 @@ class LinearStage:
             idle = aligned.state == "idle"
             self._latest = FilteredHop(mic, aligned.reference, output.innovation, located, idle, past, aligned.delay)
         return output
+
+    def stats(self) -> LinearStageStats:
+        """What it did so far, and what it removes now."""
+        return {**self.canceller.stats(), "removed_db": self.removal.removed_db}
 
     def learn(self) -> None:
         """Tell the learner of the latest hop."""
@@ -84,7 +110,8 @@ class FrontEnd:
     The engine's `front` says what it does (engines/base.py). aligner: None for "none". linear_stage: None but for "full".
     cut: (bins,) gain of every spectrum, None for 1. microphones: of an array, and None for a single one; the kinds without a
     linear stage hear its first. spatial: None but for "full" with an array. errors: (microphones, bins) of the latest frame
-    of an array. linear: what the linear stage made of the latest hop.
+    of an array. linear: what the linear stage made of the latest hop. heard: the microphone's latest hop, (hop,), without
+    its offset.
     """
 
     def __init__(
@@ -121,6 +148,8 @@ class FrontEnd:
         self.cut: Samples | None = None
         if self.linear_stage and not profile:
             self.cut = np.where(stft.frequencies < RUMBLE_HZ, np.float32(RUMBLE), np.float32(1.0))
+        self._centred = Centred(stft.hop)
+        self.heard = np.zeros(stft.hop, np.float32)
         self._nothing = np.zeros(stft.bins, np.float32)
         self._noise = profile.noise_bins(stft) if profile else self._nothing
         self._silence = np.zeros(stft.bins, np.complex64)
@@ -129,7 +158,10 @@ class FrontEnd:
     def step(self, mic: Samples, ref: Samples) -> tuple[Frame, Aligned | None]:
         """One hop (hop,) of microphone, of an array (microphones, hop), and reference to a frame, with what the aligner found."""
         stage = self.linear_stage
+        if stage:
+            mic = self._centred.step(mic)
         heard, mic = mic, self.first_of(mic)
+        self.heard = mic
         if stage is None:
             found = self.aligner.step(mic, ref) if self.aligner else None
             x, r = self._analyser.push(mic, found.reference if found else ref)
@@ -138,6 +170,8 @@ class FrontEnd:
             stage.canceller.tell_by(self.microphones.first)
         aligned = stage.aligner.step(heard, ref)
         self.linear = linear = stage.step(heard, aligned)
+        if aligned.state not in UNLOCATED:
+            stage.removal.step(mic, aligned.reference, CancellerOutput(*map(self.first_of, linear)))
         added = self._added(stage.path.source)
         if self.spatial and self.microphones:
             located = aligned.state == "locked"
@@ -154,7 +188,7 @@ class FrontEnd:
         return Frame(x, r, e, error, noise, residual, aligned.state == "idle", at_any_lag), aligned
 
     def first_of(self, mic: Samples) -> Samples:
-        """The microphone that the answer sounds like, (hop,), of mic (hop,) or (microphones, hop)."""
+        """Of all (microphones, ...) that of the microphone that the answer sounds like (...,); of a single one as it is."""
         return mic if self.microphones is None else mic[self.microphones.first]
 
     def _spectra(self, *signals: Samples) -> Spectrum:

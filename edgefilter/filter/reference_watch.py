@@ -11,8 +11,11 @@ from edgefilter.alignment.aligner import COARSE_MARGIN
 from edgefilter.alignment.delay_line import Aligned, Tape
 from edgefilter.alignment.lag_search import CERTAIN, WINDOW, LagSearch
 from edgefilter.alignment.utterances import FLOOR, OnsetDetector
+from edgefilter.dsp import fourier
 from edgefilter.filter.microphones import SILENT
-from edgefilter.types import PRE_ROLL, SAMPLE_RATE, EventKind, Samples
+from edgefilter.filter.removal import Removal
+from edgefilter.filter.robot_sound import LOUD, RobotSound
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, EventKind, Frame, Samples
 
 LATEST = SAMPLE_RATE
 """Samples by which a reference may be late and is still recognised as such."""
@@ -31,9 +34,11 @@ reference is silent, for the robot to be heard: 10 dB, more than people who talk
 MISSING, HEARD = 60 * SAMPLE_RATE, 10 * SAMPLE_RATE
 """Samples without any reference, of which so many were not silent at the microphone, SILENT of full scale: a level of the
 converter, since there is nothing else to compare with. 16 bits by themselves are 41 dB softer."""
-LITTLE_DB = 4.0
-"""Removed of the robot below which its echo counts as unpredicted. Of 36 simulated conversations the least was 9 dB, of six
-loudspeakers with humans as far below the echo as theirs 10; microphones that process their sound have -0.1 to 4."""
+FELL_SILENT = 1e-3
+"""Power of the reference, over its power while the robot talks, below which it is silent, -30 dB: the noise of a loopback is."""
+SAME, SAME_S = 0.999, 2.0
+"""Squared correlation coefficient of microphone and reference at lag 0, over so many seconds of sound, from which on they are
+one signal: sound needs some samples to a microphone, and a room and its noise leave less than -30 dB nowhere."""
 Verdict = Literal["unknown", "fits", "late"]
 
 
@@ -43,31 +48,37 @@ class ReferenceWatch:
     The aligner finds echoes that come after the reference. Here each utterance that it has not found is looked for in
     what the microphone heard before, in the same way with the channels exchanged. A robot often says what resembles an
     earlier utterance, whose echo the microphone may still hear: so what is found there must not be found as well, at the
-    same lag, in the reference that the aligner has delayed. hop: samples a step. verdict: "unknown" until an utterance
-    was found by either, or by neither for long; "fits" and "late" then.
+    same lag, in the reference that the aligner has delayed. hop: samples a step. bins: of a spectrum. verdict: "unknown"
+    until an utterance was found by either, or by neither for long; "fits" and "late" then. without: whether the robot is
+    heard while the reference is silent.
 
-    >>> watch = ReferenceWatch(256)
+    >>> watch = ReferenceWatch(256, 257)
     >>> watch.verdict, watch.wait
     ('unknown', 8000)
     """
 
-    def __init__(self, hop: int) -> None:
+    def __init__(self, hop: int, bins: int) -> None:
         self._hop = hop
         self._search = LagSearch(LATEST)
         self._mic, self._ref, self._earlier = (Tape(self._search.span) for _ in range(3))
         self._onsets = OnsetDetector(hop)
         self.verdict: Verdict = "unknown"
+        self.without = False
         self._late = self._stage = self._looks = 0
         self._to_search = SEARCH_STRIDE
         self._idle = True
         self._power = {"unfound": [0.0, 0], "idle": [0.0, 0]}
-        self._unfound_said = self._missing_said = self._unpredicted_said = self._ever = False
+        self._sound = RobotSound(hop, bins)
+        self._played, self._played_at = 0.0, -LATEST
+        self._products, self._sounding = np.zeros(3), 0
+        self._said: set[str] = set()
+        self._ever = False
         self._silent = self._heard = 0
 
     @property
     def suspect(self) -> bool:
-        """Whether what is heard may be the robot, whose reference comes later."""
-        return self.verdict == "late" and not self._idle
+        """Whether what is heard may be the robot, whose reference comes later or not at all."""
+        return self.without or (self.verdict == "late" and not self._idle)
 
     @property
     def wait(self) -> int:
@@ -79,9 +90,9 @@ class ReferenceWatch:
         return max(DOUBT, self._late + SEARCH_STRIDE)
 
     def step(
-        self, mic: Samples, ref: Samples, aligned: Aligned, removed_db: float | None
+        self, mic: Samples, ref: Samples, aligned: Aligned, frame: Frame, removal: Removal, speaking: bool
     ) -> list[tuple[EventKind, str]]:
-        """Take a hop (hop,) of both channels, what the aligner made of it, and what is removed of the robot; what is to be said."""
+        """Take a hop (hop,) of both channels and what was made of it; what is to be said. speaking: whether a human is."""
         self._mic.push(mic)
         self._ref.push(ref)
         self._earlier.push(aligned.reference)
@@ -89,20 +100,72 @@ class ReferenceWatch:
             self._stage, self._to_search, self._looks = 0, SEARCH_STRIDE, 0
         self._idle = aligned.state in ("idle", "announced")  # what was announced is no reference before it is heard
         said = self._look(aligned)
-        power = float(mic.dot(mic)) / self._hop
-        if unfound := self._weigh(power, aligned):
-            said.append(("robot_unfound", unfound))
-        if removed_db is not None and removed_db < LITTLE_DB and not self._unpredicted_said:
-            self._unpredicted_said = True
-            told = (
-                f"the linear stage removes {removed_db:.1f} dB of the robot: the microphone seems to be processed, or the"
-                " loudspeaker distorts; switch off noise suppression, gain control and echo cancellation of the device,"
-                " and turn the volume down"
-            )
-            said.append(("echo_unpredicted", told))
-        if missing := self._wait_for_any(power, float(ref.dot(ref))):
-            said.append(("reference_missing", missing))
-        return said
+        power, played = float(mic.dot(mic)) / self._hop, float(ref.dot(ref)) / self._hop
+        checks: tuple[tuple[EventKind, str], ...] = (
+            ("robot_unfound", self._weigh(power, aligned)),
+            ("echo_unpredicted", self._unpredicted(removal)),
+            ("same_signal", self._same(float(mic.dot(ref)) / self._hop, power, played)),
+            (
+                "reference_missing",
+                self._wait_for_any(power, played) or self._listen_without(played, aligned, frame, speaking),
+            ),
+        )
+        return said + [(kind, detail) for kind, detail in checks if detail]
+
+    def _once(self, what: str) -> bool:
+        """Whether this is the first time."""
+        first = what not in self._said
+        self._said.add(what)
+        return first
+
+    def _unpredicted(self, removal: Removal) -> str:
+        """Say that hardly anything of the robot can be subtracted."""
+        if not removal.unpredicted or not self._once("unpredicted"):
+            return ""
+        return (
+            f"the linear stage removes {removal.removed_db:.1f} dB of the robot: the microphone seems to be processed, or"
+            " the loudspeaker distorts; switch off noise suppression, gain control and echo cancellation of the device,"
+            " and turn the volume down"
+        )
+
+    def _same(self, cross: float, power: float, played: float) -> str:
+        """Add up the products of both channels until they hold enough sound to tell whether they are one signal."""
+        if min(power, played) > FLOOR:
+            self._products += cross, power, played
+            self._sounding += self._hop
+        if self._sounding < SAME_S * SAMPLE_RATE:
+            return ""
+        (cross, power, played), self._products, self._sounding = self._products, np.zeros(3), 0
+        if cross**2 <= SAME * power * played or not self._once("same"):
+            return ""
+        return (
+            "the microphone and the reference are the same signal: all of it is taken for the robot and removed; give the"
+            " microphone's own recording or device, and for the reference what the loudspeaker plays"
+        )
+
+    def _listen_without(self, played: float, aligned: Aligned, frame: Frame, speaking: bool) -> str:
+        """Learn what the robot sounds like, and listen for it where the reference is silent."""
+        now = self._ref.end
+        if played > FELL_SILENT * self._played:
+            self._played_at, self.without = now, False
+            self._sound.forget()
+        power = fourier.power(frame.mic)
+        if aligned.state in ("locked", "coarse") and not speaking:
+            brought = float(aligned.reference.dot(aligned.reference)) / self._hop
+            if brought > LOUD * self._onsets.peak:
+                self._played += 0.01 * (brought - self._played) if self._played else brought
+                self._sound.learn(power)
+        lag = LATEST if np.isnan(aligned.delay) else int(aligned.delay)
+        if now - self._played_at < lag + SAMPLE_RATE // 4:
+            return ""
+        robot = self._sound.compare(power, frame.noise_psd)
+        if robot is None or robot == self.without:
+            return ""
+        self.without = robot
+        return robot * (
+            f"the reference has been silent for {(now - self._played_at) / SAMPLE_RATE:.0f} s, while the microphone hears what"
+            " sounds like the robot: nothing of it is removed, and nobody is noticed; the output device may have changed"
+        )
 
     def _look(self, aligned: Aligned) -> list[tuple[EventKind, str]]:
         """One step of a search, where one is due, and what it leads to."""
@@ -134,7 +197,8 @@ class ReferenceWatch:
         self.verdict, self._late, self._looks = "late", found.lag, 0
         told = (
             f"the reference comes {1000 * found.lag / SAMPLE_RATE:.0f} ms after the microphone has heard it: the robot is"
-            " not removed, and nobody is noticed while it talks; hand the reference over earlier, or the microphone later"
+            " not removed, and nobody is noticed while it talks; hand the reference over earlier, or the microphone later;"
+            " or are the two swapped?"
         )
         return [] if known else [("reference_late", told)]
 
@@ -157,33 +221,32 @@ class ReferenceWatch:
     def _weigh(self, power: float, aligned: Aligned) -> str:
         """Compare the microphone while the reference is found nowhere with the microphone while it is silent."""
         if aligned.state == "locked":
-            self._power["unfound"], self._unfound_said = [0.0, 0], False
+            self._power["unfound"] = [0.0, 0]
+            self._said.discard("unfound")
         if aligned.state in self._power and self.verdict != "late":
             entry = self._power[aligned.state]
             entry[0] += power
             entry[1] += self._hop
         (unfound, samples), (idle, before) = self._power["unfound"], self._power["idle"]
-        if self._unfound_said or samples < UNFOUND or before < SAMPLE_RATE:
+        if samples < UNFOUND or before < SAMPLE_RATE:
             return ""
         ratio = (unfound / samples) / max(idle / before, 1e-12)
-        if ratio < LOUDER:
+        if ratio < LOUDER or not self._once("unfound"):
             return ""
-        self._unfound_said = True
         return (
             f"the microphone is {10 * np.log10(ratio):.0f} dB louder while the reference carries sound, which is not found"
             " in it: it is another sound than the loudspeaker's, too late, or processed on the way; 'edgefilter doctor'"
         )
 
-    def _wait_for_any(self, power: float, ref_energy: float) -> str:
+    def _wait_for_any(self, power: float, played: float) -> str:
         """Count what is heard while no reference ever came."""
-        self._ever = self._ever or ref_energy > FLOOR * self._hop
-        if self._ever or self._missing_said:
+        self._ever = self._ever or played > FLOOR
+        if self._ever:
             return ""
         self._silent += self._hop
         self._heard += self._hop if power > SILENT else 0
-        if self._silent < MISSING or self._heard < HEARD:
+        if self._silent < MISSING or self._heard < HEARD or not self._once("missing"):
             return ""
-        self._missing_said = True
         return (
             f"the reference has been silent for {self._silent / SAMPLE_RATE:.0f} s, since the start: if the robot has"
             " spoken, it is the wrong one"

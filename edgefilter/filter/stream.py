@@ -59,7 +59,7 @@ class Stream:
             self.stepping.reset()
         self.front = FrontEnd(self.engine, self.profile, self.learner)
         self._microphones: int | None = None
-        self._watch = ReferenceWatch(stft.hop) if self.front.linear_stage else None
+        self._watch = ReferenceWatch(stft.hop, stft.bins) if self.front.linear_stage else None
         self.events: deque[Event] = deque(maxlen=1000)
         self.speech_probability: float | None = None
         self._judge = HumanJudge(stft.hop / SAMPLE_RATE, calibrated=self.profile is not None)
@@ -178,8 +178,8 @@ class Stream:
         if aligned and aligned.realigned:
             self._tell("realigned", f"reference arrives after {aligned.delay:.1f} samples")
         if self._watch and aligned and (stage := self.front.linear_stage):
-            removed_db = stage.canceller.volume.removed_db
-            for kind, detail in self._watch.step(self.front.first_of(mic), ref, aligned, removed_db):
+            speaking = self.barge_in.speaking
+            for kind, detail in self._watch.step(self.front.heard, ref, aligned, frame, stage.removal, speaking):
                 self._tell(kind, detail)
             if stage.lesson:
                 self._tell(stage.lesson.kind, stage.lesson.detail)

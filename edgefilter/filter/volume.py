@@ -10,7 +10,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from edgefilter.dsp.fourier import LEAST
 from edgefilter.types import SAMPLE_RATE, Samples
 
 MEMORY = 0.8
@@ -26,8 +25,6 @@ NOTICED = 1e-3
 """Error power over the microphone's, -30 dB, from which on a volume is suspected; 0.3 dB of volume leave that."""
 AUDIBLE, FORGET_S = 0.01, 10.0
 """The robot is audible where the echo is within 20 dB of its recent peak, which fades by 10 dB in FORGET_S seconds."""
-ENOUGH_S = 3.0
-"""Seconds of audible robot from which on it is said how much is removed."""
 MOST = 10.0
 """Largest factor, 20 dB, by which the volume is followed from where it was at first, up or down; and the factor by which
 a path that began unknown must have lowered the microphone's power before its volume means anything."""
@@ -86,8 +83,7 @@ class Volume:
         self._patience = round(PATIENCE_S * SAMPLE_RATE / hop)
         self._path: Literal["known", "unknown", "unscaled", "tried"] = path
         self._peak = 0.0
-        self._smoothed = self._since = self._lasting = Moments()
-        self._wanted = round(ENOUGH_S * SAMPLE_RATE / hop)
+        self._smoothed = self._since = Moments()
         self._factor, self._count, self._age, self._rest = 1.0, 0, 0, 0
         self.gain = self._first = 1.0
 
@@ -96,22 +92,12 @@ class Volume:
         """Whether a factor is being looked for or tried: the path is better left as it is until then."""
         return self._path in ("unscaled", "tried")
 
-    @property
-    def removed_db(self) -> float | None:
-        """How far the subtraction has lowered the microphone over the last FORGET_S of robot; None before ENOUGH_S of it."""
-        if self._wanted > 0 or not self._lasting.mic:
-            return None
-        return -10.0 * math.log10(max(self._lasting.left() / self._lasting.mic, LEAST))
-
     def follow(self, mic: Samples, echo: Samples) -> float:
         """The factor by which the echo path is to be scaled now, 1 where nothing says so. mic, echo: (hop,)."""
         now = Moments.of(pre_emphasised(mic), pre_emphasised(echo))
         self._peak = max(now.echo, self._forget * self._peak)
         self._smoothed = self._smoothed.smoothed(now)
         audible = now.echo > AUDIBLE * self._peak
-        if audible and not self.suspected:
-            self._lasting = self._lasting.plus(now, self._forget)
-            self._wanted -= 1
         if self._path == "unknown":
             if audible and self._smoothed.mic > MOST * self._smoothed.left():
                 self._path = "known"

@@ -78,31 +78,3 @@ def test_a_path_that_explains_nothing_is_adapted_after_a_moment_all_the_same():
     for hop, heard in zip(echo[:16_128].reshape(-1, 256), other[:16_128].reshape(-1, 256), strict=True):
         volume.follow(heard, hop)
     assert not volume.suspected
-
-
-@pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4])
-def test_what_is_removed_counts_from_the_scale_that_was_found(scale):
-    """The few hops until then said for many seconds that the robot was made louder by up to 77 dB."""
-    volume, echo = Volume(256, "unscaled"), hops_of_robot(6.0)
-    told = []
-    for hop in echo:
-        volume.follow(hop, np.float32(scale * volume.gain) * hop)
-        told.append(volume.removed_db)
-    known = [removed for removed in told if removed is not None]
-    assert len(known) > 60 and min(known) > 60.0
-
-
-def test_hops_in_which_a_turned_volume_is_tried_do_not_lower_what_is_removed():
-    volume, echo = Volume(256), hops_of_robot(6.0)
-    told = []
-    for at, hop in enumerate(echo):
-        volume.follow(hop * np.float32(5.0 if at > 280 else 1.0), np.float32(volume.gain) * hop)
-        told.append(volume.removed_db)
-    assert volume.gain == pytest.approx(5.0, rel=0.01)
-    assert min(told[281:]) > 6.0
-
-
-def hops_of_robot(seconds: float) -> np.ndarray:
-    """(n, 256)."""
-    echo = robot_speech(seconds, seed=1)
-    return echo[: echo.size // 256 * 256].reshape(-1, 256)
