@@ -30,17 +30,21 @@ class Centred:
     """Takes a constant offset off a signal, hop by hop: its running mean at first, later what the last OFFSET_S had."""
 
     def __init__(self, hop: int) -> None:
-        self._follow = hop / (OFFSET_S * SAMPLE_RATE)
-        self._ramp = np.arange(1, hop + 1, dtype=np.float32) / np.float32(hop)
+        self._follow = np.float32(hop / (OFFSET_S * SAMPLE_RATE))
+        self._mean = np.float32(1.0 / hop)
+        self._ramp = np.arange(1, hop + 1, dtype=np.float32) * self._mean
         self._hops = 0
-        self._offset = np.zeros(1, np.float32)
+        self._offset: Samples | None = None
 
     def step(self, x: Samples) -> Samples:
         """The next hop x (..., hop) without its offset."""
-        mean, self._hops = x.mean(axis=-1, keepdims=True), self._hops + 1
-        before = self._offset if self._hops > 1 else mean
-        self._offset = before + np.float32(max(self._follow, 1.0 / self._hops)) * (mean - before)
-        return x - (before + (self._offset - before) * self._ramp)
+        mean = self._mean * np.add.reduce(x, axis=-1, keepdims=True)
+        before, self._hops = mean if self._offset is None else self._offset, self._hops + 1
+        moved = max(self._follow, np.float32(1.0 / self._hops)) * (mean - before)
+        self._offset = before + moved
+        offset = moved * self._ramp
+        offset += before
+        return np.subtract(x, offset, out=offset)
 
 
 class LinearStage:

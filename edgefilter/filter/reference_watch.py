@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from typing import Literal
 
@@ -149,16 +150,15 @@ class ReferenceWatch:
         if played > FELL_SILENT * self._played:
             self._played_at, self.without = now, False
             self._sound.forget()
-        power = fourier.power(frame.mic)
         if aligned.state in ("locked", "coarse") and not speaking:
             brought = float(aligned.reference.dot(aligned.reference)) / self._hop
             if brought > LOUD * self._onsets.peak:
                 self._played += 0.01 * (brought - self._played) if self._played else brought
-                self._sound.learn(power)
-        lag = LATEST if np.isnan(aligned.delay) else int(aligned.delay)
+                self._sound.learn(fourier.power(frame.mic))
+        lag = LATEST if math.isnan(aligned.delay) else int(aligned.delay)
         if now - self._played_at < lag + SAMPLE_RATE // 4:
             return ""
-        robot = self._sound.compare(power, frame.noise_psd)
+        robot = self._sound.compare(fourier.power(frame.mic), frame.noise_psd)
         if robot is None or robot == self.without:
             return ""
         self.without = robot

@@ -47,9 +47,8 @@ class Removal:
 
     def step(self, mic: Samples, reference: Samples, found: CancellerOutput) -> None:
         """Take one hop (hop,) of the microphone and of the reference at a known lag, and what the linear stage made of them."""
-        heard, left, played, innovation = (
-            float(x.dot(x)) for x in map(pre_emphasised, (mic, found.error, reference, found.innovation))
-        )
+        emphasised = pre_emphasised(np.array((mic, found.error, reference, found.innovation)))
+        heard, left, played, innovation = np.einsum("ij,ij->i", emphasised, emphasised).tolist()
         self._peak = max(played, self._forget * self._peak)
         if not self._peak:
             return
