@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 
@@ -256,7 +257,7 @@ class Aligner:
         return self._switch(float(AHEAD), 3.0)
 
     def _switch(self, delay: float, deviation: float) -> bool:
-        if self._coarse:  # the canceller has learned what arrives behind that lag
+        if self._coarse and not math.isnan(self._read_at):  # the canceller has learned what arrives behind that lag
             self._margin = max(round(delay - self._read_at), PRE_ROLL)
             self._meter = DelayMeter()  # the other has learned what arrives around the coarse lag
             self._gain = None

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
+from scipy import signal
 
 import edgefilter
 from bench.simulate.simulated_robot import warp
@@ -16,6 +17,7 @@ from edgefilter.engines.linear import Linear
 from edgefilter.filter.canceller import Canceller
 from edgefilter.filter.front_end import FrontEnd
 from tests.conformance import robot_speech
+from tests.learning.scenes import voice
 
 HOP = 256
 DEMO = Path(edgefilter.__file__).parent / "demo_data"
@@ -205,3 +207,19 @@ def test_a_lag_of_nearly_two_seconds_is_found(path):
     aligner = Aligner(HOP)
     found = [aligner.step(*pair).delay for pair in zip(hops(mic), hops(x), strict=True)]
     assert 31_000 - HOP < found[-1] < 31_000 + 600 + HOP
+
+
+def test_a_coarse_lag_and_a_sharp_arrival_may_be_found_in_the_same_hop():
+    """Nothing had been read at the coarse lag yet: not a number of samples."""
+    rng = np.random.default_rng(306)
+    x, lag = voice(306 % 40, 4.0), rng.integers(500, 4000)
+    path = rng.standard_normal(rng.integers(200, 3000))
+    path *= np.exp(-np.arange(path.size) / rng.uniform(50, 1500))
+    path[0] += rng.uniform(0, 8)
+    mic = np.roll(signal.oaconvolve(x, path)[: x.size], lag)
+    mic[:lag] = 0.0
+    mic += rng.uniform(0, 0.3) * np.std(mic) * rng.standard_normal(mic.size)
+    aligner = Aligner(HOP)
+    for pair in zip(hops(mic.astype(np.float32)), hops(x), strict=True):
+        aligned = aligner.step(*pair)
+    assert aligned.state == "locked" and abs(aligned.delay - lag) < 2
