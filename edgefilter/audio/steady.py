@@ -8,40 +8,15 @@ from contextlib import suppress
 
 import numpy as np
 
-from edgefilter.audio.pairing import BUFFER_S, TOLERANCE, WINDOW
+from edgefilter.audio.pairing import BUFFER_S
 from edgefilter.audio.port import START_S, InputPort, SpokenReference, clock
 from edgefilter.audio.protocols import Sink
+from edgefilter.audio.sample_clock import SampleClock
 from edgefilter.errors import DeviceError
 from edgefilter.types import SAMPLE_RATE, Samples
 
 RETRY_S = 1.0
 """Between two attempts to open a device that is away."""
-
-
-class SampleClock:
-    """Sound that a device should have delivered by the clock and did not, because a driver or a sleeping machine lost it.
-
-    missed: seconds so far. Compares, from one WINDOW to the next, by how much the device was behind the clock at least:
-    late sound catches up within a window, lost sound does not, and clocks that differ by 300 ppm change it by far less
-    than the TOLERANCE. What comes after all, from a machine that was too busy for longer, is taken off again.
-    """
-
-    def __init__(self) -> None:
-        self.missed = 0.0
-        self._base: float | None = None
-        self._least = np.inf
-        self._until: float | None = None
-
-    def note(self, delivered_s: float, now: float) -> None:
-        """Take note of the seconds of sound that came so far."""
-        if self._until is None:
-            self._until = now + WINDOW / SAMPLE_RATE
-        if now >= self._until:
-            before, self._base = self._base, self._least
-            if before is not None and abs(self._base - before) > TOLERANCE / SAMPLE_RATE:
-                self.missed = max(0.0, self.missed + self._base - before)
-            self._least, self._until = np.inf, now + WINDOW / SAMPLE_RATE
-        self._least = min(self._least, now - delivered_s)
 
 
 class SteadyInput:
@@ -57,7 +32,7 @@ class SteadyInput:
         self.port = make()
         self.filled = self.gone = self.back = 0
         self._earlier_lost = self._earlier_overruns = 0
-        self._open, self._clock = False, SampleClock()
+        self._open, self._clock = False, SampleClock(BUFFER_S)
         self._failure: DeviceError | None = None
         self._latest = np.zeros(0, np.float32)
         self._received_at = self._gone_at = self._tried_at = 0.0
@@ -137,7 +112,7 @@ class SteadyInput:
             return
         if port is not self.port:
             self._earlier_lost, self._earlier_overruns = self.lost, self.overruns
-        self.port, self._clock, self._open = port, SampleClock(), True
+        self.port, self._clock, self._open = port, SampleClock(BUFFER_S), True
 
 
 class SteadySink(Sink):

@@ -2,8 +2,8 @@
 
 An agent's two directions share no sample counter. It hands speech over in bursts, faster than it is played, or late,
 and drops the rest when it is interrupted. Here the microphone is the clock: speech waits in a queue, and each sample of
-the microphone takes one from it, as the loudspeaker does. Speech that is dropped from the queue was never played and
-is no reference. The filter's aligner finds how much later the reference is heard.
+the microphone takes one from it, as the loudspeaker does; what the microphone has lost by the clock takes some, too.
+Speech that is dropped from the queue was never played and is no reference. The filter's aligner finds how much later the reference is heard.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from edgefilter.audio.raw import delivered, of_pcm16, to_pcm16
+from edgefilter.audio.sample_clock import SampleClock
 from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import UsageError
 from edgefilter.filter.barge_in import BargeInSettings
@@ -27,8 +28,14 @@ from edgefilter.types import SAMPLE_RATE, SET_UP_WRONG, Event, Samples
 
 MOST_QUEUED_S = WAITING_S
 """Speech that may wait to be played, as much as turns may wait: longer than any answer. The rest is refused and counted."""
-ABSENT_S = 1.0
-"""A microphone that delivers nothing for so long was off: event loops stand still for tenths of a second, not more."""
+LOOK_S, STALL_S = 0.15, 0.25
+"""How long a small delay of the microphone must last to count as lost sound, longer than transports of 100 ms are quiet; and
+a delay that counts after a tenth of that: a program that stood still for so long finds all that it has missed waiting."""
+WAITED_S, HELD_S = 1e-3, 0.1
+"""Seconds between two calls from which on nothing was waiting: a program that is behind calls at once; and a delay for which
+the microphone's sound is held back until it is decided, within 0.1 s, whether it was lost."""
+BACK_S = 2.0
+"""Seconds of reference that are kept, to be used again where sound that seemed lost comes after all."""
 PATIENCE_S = 0.12
 """How long the microphone waits for late speech: three times the 40 ms that a Pipecat transport hands over at once."""
 PACE_S, PACE_NEAR = 5.0, 0.01
@@ -117,10 +124,12 @@ class Duplex:
         self._from_mic, self._to_agent = (Resampler(SAMPLE_RATE, SAMPLE_RATE) for _ in range(2))
         self._mic = np.zeros(0, np.float32)
         self._pace = Pace(clock)
+        self._losses, self._delivered_s, self._timed = SampleClock(LOOK_S, STALL_S), 0.0, False
+        self._taken: deque[Samples] = deque()
         self._kept: deque[Event] = deque(maxlen=1000)
         self.enabled = True
-        self._talking = self._paused = self._deaf = self._averaged = False
-        self._talking_since = self._heard_at = clock()
+        self._talking = self._paused = self._held = self._deaf = self._averaged = False
+        self._talking_since = self._left_at = clock()
 
     def play(self, samples: Samples, rate: int) -> None:
         """Take speech that is handed to the loudspeaker, (n,) at rate, to be played after all that was before it."""
@@ -159,10 +168,11 @@ class Duplex:
             self._take(round(skipped_s * SAMPLE_RATE), "dropped")
             self._paused = False
 
-    def hear(self, samples: Samples, rate: int) -> Samples:
+    def hear(self, samples: Samples, rate: int, at_s: float | None = None) -> Samples:
         """Take the microphone's next samples at rate and return finished samples of the human (m,), at the same rate.
 
-        samples: (n,), of an array (n, channels), as many channels in each call. One call may return none or more than
+        samples: (n,), of an array (n, channels), as many channels in each call. at_s: when the first of them was recorded,
+        by the sender's clock, where that is known; sound that was lost on the way shows by it at once. One call may return none or more than
         came in. All together are as many as came in, later by the filter's latency and, at another rate than 16 kHz, by
         the resamplers' 3.5 ms each way.
         """
@@ -175,7 +185,7 @@ class Duplex:
             pushed = self._from_mic.push(samples)
             self._mic = np.concatenate((self._mic, pushed)) if len(self._mic) else pushed
             with self._queue_lock:
-                self._forget_unheard(len(samples) / rate)
+                self._follow_losses(len(samples) / rate, at_s)
                 reference = self._reference()
             mic, self._mic = self._mic[: reference.size], self._mic[reference.size :]
             if self._both:
@@ -188,6 +198,7 @@ class Duplex:
             if wrong := self._pace.note(len(samples), rate):
                 events.append(Event("rate_mismatch", self.heard, wrong))
             self.heard += len(mic)
+            self._left_at = self._clock()
         for event in events:
             if event.kind in SET_UP_WRONG:
                 _LOGGER.warning("%s: %s", event.kind.replace("_", " "), event.detail)
@@ -208,13 +219,20 @@ class Duplex:
             if event.turn is not None:
                 drop_sound(self._kept)
 
-    def hear_pcm16(self, pcm: bytes | memoryview, rate: int, channels: int = 1, answers: int | None = None) -> bytes:
+    def hear_pcm16(
+        self,
+        pcm: bytes | memoryview,
+        rate: int,
+        channels: int = 1,
+        answers: int | None = None,
+        at_s: float | None = None,
+    ) -> bytes:
         """As `hear`, for 16-bit samples, interleaved; answers: channels of the answer, each of them the human, None: as came in."""
         if channels > 1 and self._wanted is None and not self._averaged:
             self._averaged = True
             _LOGGER.warning("%d channels averaged to one: name the microphones of an array (mic_channels)", channels)
         samples = from_pcm16(pcm, channels) if self._wanted is None else of_pcm16(pcm, channels)
-        return as_pcm16(self.hear(samples, rate), answers or channels)
+        return as_pcm16(self.hear(samples, rate, at_s), answers or channels)
 
     def require_judge(self, what: str) -> None:
         """Raise UsageError where an engine of the filter judges no speech: what would never notice the human."""
@@ -256,7 +274,7 @@ class Duplex:
 
     def _reference(self) -> Samples:
         """What was played while the waiting samples of the microphone were recorded; shorter where they wait on."""
-        count = len(self._mic)
+        count = 0 if self._held else len(self._mic)
         if self._paused:
             return np.zeros(count, np.float32)
         if self._talking and count > self._queued:
@@ -269,15 +287,37 @@ class Duplex:
         taken = self._take(count, "played")
         return taken if taken.size == count else np.concatenate((taken, np.zeros(count - taken.size, np.float32)))
 
-    def _forget_unheard(self, heard_s: float) -> None:
-        """Skip what was played while the microphone was off.
+    def _follow_losses(self, heard_s: float, at_s: float | None) -> None:
+        """Skip what was played while the microphone's sound was lost, and take it back where that comes after all.
 
-        If it was only late after all, the reference is early, which the aligner finds; it could not find a late one.
+        A reference that is early after a wrong guess is found by the aligner; a late one could not be.
         """
-        now, since = self._clock(), max(self._heard_at, self._talking_since)
-        self._heard_at = now
-        if not self._paused and now - since - heard_s > ABSENT_S:
-            self._take(round((now - since - heard_s) * SAMPLE_RATE), "unheard")
+        now = self._clock()
+        self._delivered_s += heard_s
+        waited = now - self._left_at >= WAITED_S
+        self._held = False
+        if self._paused or (at_s is not None) != self._timed:
+            self._timed = at_s is not None
+            self._losses = SampleClock(0.0 if self._timed else LOOK_S, STALL_S)
+        elif waited or at_s is not None:
+            lost_s = self._losses.note(self._delivered_s, now if at_s is None else at_s + heard_s)
+            self._held = self._talking and self._losses.doubt_s > HELD_S
+            if lost_s > 0.0:
+                self._take(round(min(lost_s, max(now - self._talking_since, 0.0)) * SAMPLE_RATE), "unheard")
+            elif lost_s < 0.0:
+                self._put_back(min(round(-lost_s * SAMPLE_RATE), self._samples["unheard"]))
+
+    def _put_back(self, count: int) -> None:
+        """Let the latest count samples of the reference come again: what they are to be paired with was late, not lost."""
+        while count and self._taken:
+            part = self._taken.pop()
+            if part.size > count:
+                self._taken.append(part[:-count])
+                part = part[-count:]
+            self._queue.appendleft(part)
+            self._queued += part.size
+            self._samples["unheard"] -= part.size
+            count -= part.size
 
     def _append(self, samples: Samples) -> None:
         fits = samples[: max(0, round(MOST_QUEUED_S * SAMPLE_RATE) - self._queued)]
@@ -303,6 +343,12 @@ class Duplex:
             count -= part.size
             self._queued -= part.size
             self._samples[what] += part.size
+        if what == "dropped":
+            self._taken.clear()
+            return np.zeros(0, np.float32)
+        self._taken.extend(parts)
+        while self._taken and sum(part.size for part in self._taken) - self._taken[0].size > BACK_S * SAMPLE_RATE:
+            self._taken.popleft()
         return np.concatenate(parts) if parts else np.zeros(0, np.float32)
 
 

@@ -41,12 +41,14 @@ from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.filter.turns import BEFORE_S
 from edgefilter.integrations.channels import named, numbers
-from edgefilter.integrations.duplex import ABSENT_S, MOST_QUEUED_S, Duplex, as_pcm16, from_pcm16
+from edgefilter.integrations.duplex import MOST_QUEUED_S, Duplex, as_pcm16, from_pcm16
 from edgefilter.integrations.turns import TurnByTurn
 from edgefilter.types import SAMPLE_RATE, Event
 
 MOST_BYTES = round(MOST_QUEUED_S * SAMPLE_RATE) * np.int16().itemsize
 """Size of a message, and of all that a client has said and waits to be played: the queue's ten minutes, 19 MB."""
+RETRY_S = 1.0
+"""Between two attempts to reach the microphone."""
 AHEAD_S = 0.5
 """Speech that the loudspeaker gets before its turn: the size of aplay's buffer. The rest is still here when it is dropped."""
 UNDER_WAY_S = BargeInSettings.min_silence_s + BEFORE_S
@@ -154,8 +156,8 @@ class EgoService:
                 why = "ended"
             except Exception as error:  # another service's messages must not end this one
                 why = f"cannot be read ({type(error).__name__}: {error})"
-            _LOGGER.warning("microphone %s %s: again in %.0f s", self._microphone, why, ABSENT_S)
-            await asyncio.sleep(ABSENT_S)
+            _LOGGER.warning("microphone %s %s: again in %.0f s", self._microphone, why, RETRY_S)
+            await asyncio.sleep(RETRY_S)
 
     def _microphone_client(self) -> AsyncClient:
         """A client of the command, which is read by the hop, or of the service at a URI."""
@@ -166,7 +168,8 @@ class EgoService:
         return MicProcessAsyncClient(form.rate, 2, form.channels, samples, program, words)
 
     async def _hear(self, chunk: AudioChunk) -> None:
-        human = await asyncio.to_thread(self.duplex.hear_pcm16, chunk.audio, chunk.rate, chunk.channels, 1)
+        at_s = None if chunk.timestamp is None else chunk.timestamp / 1000
+        human = await asyncio.to_thread(self.duplex.hear_pcm16, chunk.audio, chunk.rate, chunk.channels, 1, at_s)
         if human:
             self._tell(AudioChunk(chunk.rate, 2, 1, human, chunk.timestamp).event())
         while self._events:

@@ -9,9 +9,10 @@ import soundfile
 
 from edgefilter.audio.files import FileSink, FileSource
 from edgefilter.audio.live import LiveSink, LiveSource
-from edgefilter.audio.pairing import TOLERANCE, WINDOW
+from edgefilter.audio.pairing import BUFFER_S, TOLERANCE, WINDOW
 from edgefilter.audio.protocols import Troubles
-from edgefilter.audio.steady import SampleClock, SteadySink
+from edgefilter.audio.sample_clock import SampleClock
+from edgefilter.audio.steady import SteadySink
 from edgefilter.cli import main
 from edgefilter.commands.run import limited
 from edgefilter.errors import DeviceError, UsageError
@@ -194,7 +195,7 @@ def test_patience_that_is_over_ends_the_run_with_what_was_heard(both, tmp_path):
 
 
 def test_late_sound_is_not_lost_and_drift_is_no_loss():
-    watch, delivered = SampleClock(), 0.0
+    watch, delivered = SampleClock(BUFFER_S), 0.0
     for tick in range(19_900):
         now = tick * 0.01
         if not (tick // 100) % 7 == 3:  # a second's pause now and then, after which all of it comes

@@ -86,7 +86,7 @@ def talking(room_of, pair):
 @pytest.fixture
 def ego(room_of, monkeypatch):
     """The room's time is not the machine's: a slow machine is no microphone that was off."""
-    monkeypatch.setattr(duplex, "ABSENT_S", 1e9)
+    monkeypatch.setattr(duplex, "WAITED_S", 1e9)
     return Watched(room_of.PROFILE)
 
 

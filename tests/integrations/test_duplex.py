@@ -1,11 +1,14 @@
 """What an agent's clock does to its speech, and what of it becomes the filter's reference."""
 
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
+import soundfile
 import soxr
 
+import edgefilter
 from edgefilter import EgoFilter, SignalError, UsageError
 from edgefilter.dsp.resample import Resampler
 from edgefilter.integrations import duplex as module
@@ -14,6 +17,7 @@ from edgefilter.integrations.turns import TurnByTurn
 from edgefilter.types import Event, Turn
 
 RATE = 16000
+DEMO = Path(edgefilter.__file__).parent / "demo_data"
 VOICE = 0.1 * np.random.default_rng(0).standard_normal(2 * RATE).astype(np.float32)
 
 
@@ -150,10 +154,12 @@ def test_what_was_played_while_the_microphone_was_off_is_not_heard_later(witness
     for _ in range(50):
         clock.now += 0.02
         listen(duplex, 0.02)
-    clock.now += 5.02  # muted for 5 s
-    listen(duplex, 0.02)
+    clock.now += 5.0  # muted for 5 s
+    for _ in range(2):
+        clock.now += 0.02
+        listen(duplex, 0.02)
     assert duplex.stats()["unheard_s"] == pytest.approx(5.0, abs=0.01)
-    np.testing.assert_array_equal(witness.reference[-320:], np.tile(VOICE, 5)[6 * RATE : 6 * RATE + 320])
+    np.testing.assert_array_equal(witness.reference[-640:], np.tile(VOICE, 5)[6 * RATE : 6 * RATE + 640])
 
 
 def test_a_microphone_that_comes_in_bursts_loses_no_reference(witness):
@@ -164,6 +170,107 @@ def test_a_microphone_that_comes_in_bursts_loses_no_reference(witness):
         clock.now += 0.8  # the event loop stood still
         listen(duplex, 0.8)
     np.testing.assert_array_equal(witness.reference, VOICE[: 8 * RATE // 5])
+
+
+SAID = np.arange(1, 10 * RATE + 1, dtype=np.float32) / 2**18
+"""10 s, of which each sample tells its place."""
+
+
+def heard_by(duplex, clock, frames):
+    """Let frames come to the microphone, each (when it comes, s; its first sample); where the reference of each was taken."""
+    ego = duplex.ego
+    at = []
+    for now, sample in frames:
+        clock.now = now
+        before = ego.reference.size
+        duplex.hear(np.zeros(320, np.float32), RATE)
+        came = ego.reference[before:][-320:]
+        at.append(round(float(came[0]) * 2**18) - 1 - sample if came.size else None)
+    return at
+
+
+def talking(witness):
+    clock = Clock()
+    duplex = Duplex(witness, clock=clock)
+    duplex.play(SAID, RATE)
+    return duplex, clock
+
+
+def test_a_hole_in_the_microphone_s_sound_is_followed_within_a_tenth_of_a_second_and_nothing_is_paired_wrongly(witness):
+    """A driver's overrun of 0.2 s; until the utterance ended the robot was not removed."""
+    duplex, clock = talking(witness)
+    frames = [(0.02 * k + 0.02, 320 * k) for k in range(90) if not 40 <= k < 50]
+    shift = heard_by(duplex, clock, frames)
+    assert set(shift[:40]) == {0}
+    assert set(shift[40:45]) <= {None, 0} and set(shift[45:]) == {0}, "held back, then where it belongs"
+    assert duplex.stats()["unheard_s"] == pytest.approx(0.2, abs=1e-3)
+
+
+def test_twenty_milliseconds_lost_each_second_are_followed(witness):
+    duplex, clock = talking(witness)
+    frames = [(0.02 * k + 0.02, 320 * k) for k in range(400) if k % 50 != 49]
+    shift = heard_by(duplex, clock, frames)
+    assert all(shift[49 * n + 7 : 49 * n + 49] == [0] * 42 for n in range(8)), "0.14 s after each loss"
+    assert duplex.stats()["unheard_s"] == pytest.approx(7 * 0.02, abs=1e-3)
+
+
+@pytest.mark.parametrize("stall", [0.03, 0.1, 0.3, 0.9])
+def test_a_loop_that_stood_still_and_finds_all_of_it_waiting_has_lost_nothing(witness, stall):
+    duplex, clock = talking(witness)
+    frames = [(max(0.02 * k + 0.02, 1.0 + stall if k >= 50 else 0.0), 320 * k) for k in range(120)]
+    shift = heard_by(duplex, clock, frames)
+    wrong = [at for at in shift if at not in (0, None)]
+    assert len(wrong) <= 1 and shift[-20:] == [0] * 20
+    assert duplex.stats()["unheard_s"] == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("together", [2, 5])
+def test_frames_that_come_several_at_once_are_no_loss(witness, together):
+    duplex, clock = talking(witness)
+    rng = np.random.default_rng(0)
+    frames = [(0.02 * together * (k // together + 1) + rng.uniform(0, 0.005), 320 * k) for k in range(300)]
+    assert set(heard_by(duplex, clock, frames)) == {0} and duplex.stats()["unheard_s"] == 0
+
+
+@pytest.mark.parametrize("ppm", [-300, 300])
+def test_a_clock_that_differs_is_no_loss(witness, ppm):
+    duplex, clock = talking(witness)
+    frames = [((0.02 * k + 0.02) * (1 + 1e-6 * ppm), 320 * k) for k in range(450)]
+    assert set(heard_by(duplex, clock, frames)) == {0} and duplex.stats()["unheard_s"] == 0
+
+
+def test_sound_that_comes_after_all_is_paired_as_if_it_had_come_in_time(witness):
+    """Late by 0.2 s for half a second: taken for lost, until all of it comes at once."""
+    duplex, clock = talking(witness)
+    late = {k: 0.02 * k + 0.22 for k in range(50, 75)} | {k: 1.7 + 1e-4 * k for k in range(75, 85)}
+    shift = heard_by(duplex, clock, [(late.get(k, 0.02 * k + 0.02), 320 * k) for k in range(140)])
+    assert shift[-40:] == [0] * 40 and duplex.stats()["unheard_s"] == pytest.approx(0.0, abs=2e-3)
+
+
+def test_a_loss_shows_at_once_in_frames_that_carry_their_time(witness):
+    duplex, clock = talking(witness)
+    for k in [*range(40), *range(55, 80)]:
+        clock.now = 1.0 + 0.02 * k
+        duplex.hear(np.zeros(320, np.float32), RATE, at_s=0.02 * k)
+    assert duplex.stats()["unheard_s"] == pytest.approx(0.3, abs=1e-3)
+    np.testing.assert_array_equal(witness.reference[40 * 320 : 41 * 320], SAID[55 * 320 : 56 * 320])
+
+
+@pytest.mark.slow
+def test_a_robot_is_removed_though_the_microphone_lost_a_fifth_of_a_second_of_it(room_of):
+    mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
+    clock = Clock()
+    duplex, out, happened = Duplex(EgoFilter(room_of.PROFILE, "crnn"), clock=clock), [], []
+    for at in range(0, 6 * RATE, 320):
+        clock.now = (at + 320) / RATE
+        duplex.play(ref[at : at + 320], RATE)
+        if not 3.0 <= at / RATE < 3.2:
+            out.append(duplex.hear(mic[at : at + 320], RATE))
+        happened += duplex.events()
+    human = np.concatenate(out)[round(3.4 * RATE) :]
+    heard = mic[round(3.6 * RATE) : 6 * RATE]
+    assert 10 * np.log10(np.mean(heard**2) / np.mean(human**2)) > 20.0
+    assert not {event.kind for event in happened} & {"reference_late", "echo_unpredicted"}
 
 
 def test_a_paused_loudspeaker_goes_on_where_it_stopped_but_for_what_it_threw_away(witness):
