@@ -28,7 +28,7 @@ from edgefilter.filter.echo_path import Learner
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.learning.background import BackgroundLearner
 from edgefilter.profile.data import Profile
-from edgefilter.session import RunReport, filter_blocks
+from edgefilter.session import RunReport, Verdict, filter_blocks
 from edgefilter.types import ALL_CHANNELS, SAMPLE_RATE, Block
 
 FILE_ENDINGS = (".wav", ".flac", ".ogg", ".mp3", ".aiff", ".aif", ".w64", ".opus", ".txt", ".raw", ".pcm")
@@ -264,6 +264,21 @@ def _say_end(args: argparse.Namespace, report: RunReport, missed: str) -> None:
         f"{how} {seconds:.1f} s in {report.wall_s:.1f} s{factor}; {report.samples_out} samples to {args.output},"
         f" {report.lost} lost{missed}"
     )
+    if report.verdict:
+        for line in verdict_lines(report.verdict):
+            say(line)
+
+
+def verdict_lines(verdict: Verdict) -> list[str]:
+    """How much of the robot was removed, at which lag, how often a human was noticed, and what was wrong, a line each."""
+    told = []
+    if verdict.removed_db is not None:
+        after = "" if verdict.lag_ms is None else f", heard {verdict.lag_ms:.0f} ms after the reference"
+        told.append(f"the robot alone was lowered by {verdict.removed_db:.1f} dB{after}")
+    if verdict.noticed is not None:
+        times = "never" if not verdict.noticed else "once" if verdict.noticed == 1 else f"{verdict.noticed} times"
+        told.append(f"a human was noticed {times}")
+    return [*(["; ".join(told)] if told else []), *(f"wrong: {why}" for why in verdict.wrong)]
 
 
 @contextmanager

@@ -44,6 +44,8 @@ ORDINARY = 2.0
 CUT, CUT_DB = 32, -30.0
 """A reference begins or ends in the middle of a word where so many samples (2 ms) at its end are no further below its
 loudest 20 ms: pauses are softer."""
+LEADS_MS = 5.0
+"""By which a recording may have the robot's voice before the reference has it: recorders that are started by hand differ."""
 PAUSE_S, LAG_STEP = 0.5, 480
 """Silence of the reference after which a player may have started anew, and samples (30 ms) by which the lag must differ
 then: less is left for the effects to explain."""
@@ -139,6 +141,11 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
         usable[:begin], usable[end:] = False, False
         warnings += (
             f"the reference is cut in mid-word: only {begin / SAMPLE_RATE:.1f} to {end / SAMPLE_RATE:.1f} s are evaluated",
+        )
+    if (lead_ms := -1000.0 * (profile.delay + offset) / SAMPLE_RATE) > LEADS_MS:
+        warnings += (
+            f"the recording has the robot {lead_ms:.0f} ms before the reference: are the two swapped, or did the recording of"
+            " the reference begin later?",
         )
     if len(pieces) > 1:
         lags = ", ".join(f"{lag:.1f} from {first / SAMPLE_RATE:.1f} s" for first, _, lag in pieces)

@@ -15,6 +15,9 @@ LIKELY_HZ = 50.0
 """The same where the prediction's power weighs a cross-spectrum."""
 LOWEST_HZ = 100.0
 """A voice and its room begin here; what lies below is rumble."""
+ONE_SIGNAL = 0.999
+"""Squared correlation coefficient of two signals, sample by sample, from which on they are one: sound needs some samples to
+a microphone, and a room and its noise leave less than -30 dB nowhere."""
 SAME = 0.98
 """Correlation of a copy with what it is a copy of, both cut from the same second at a lag of some ms."""
 
@@ -112,3 +115,12 @@ def played_in(heard: Samples, played: Samples) -> bool:
     cross = fft.irfft(fft.rfft(heard, size) * fft.rfft(played, size).conj(), size)
     whole = np.sqrt(float(np.vdot(heard, heard)) * float(np.vdot(played, played)))
     return bool(np.abs(cross).max() > SAME * whole > 0.0)
+
+
+def one_signal(cross: float, first: float, second: float) -> bool:
+    """Whether two signals are the same but for a gain. cross, first, second: sums of their products and of their squares.
+
+    >>> one_signal(2.0, 1.0, 4.0), one_signal(1.9, 1.0, 4.0), one_signal(0.0, 0.0, 0.0)
+    (True, False, False)
+    """
+    return cross**2 > ONE_SIGNAL * first * second

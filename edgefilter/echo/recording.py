@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from edgefilter.dsp.lag import one_signal
 from edgefilter.errors import SignalError
 from edgefilter.types import SAMPLE_RATE, Samples, as_samples
 
@@ -22,7 +23,7 @@ def fitted_blocks(n: int) -> NDArray[np.bool_]:
 def paired(recording: object, reference: object) -> tuple[Samples, Samples]:
     """Both as float32 of the recording's length, silence behind a shorter reference.
 
-    Raises SignalError where either is shorter than MIN_SECONDS.
+    Raises SignalError where either is shorter than MIN_SECONDS, and where both are the same signal.
     """
     y, x = as_samples(recording, "recording"), as_samples(reference, "reference")
     for samples, name in ((y, "recording"), (x, "reference")):
@@ -31,4 +32,10 @@ def paired(recording: object, reference: object) -> tuple[Samples, Samples]:
             raise SignalError(
                 f"the {name} is {seconds:.2f} s long, expected at least {MIN_SECONDS:g} s of the robot's voice"
             )
-    return y, np.pad(x, (0, max(y.size - x.size, 0)))[: y.size]
+    x = np.pad(x, (0, max(y.size - x.size, 0)))[: y.size]
+    if one_signal(float(y.dot(x)), float(y.dot(y)), float(x.dot(x))):
+        raise SignalError(
+            "the recording and the reference are the same signal: give what the microphone recorded, and for the reference"
+            " what was sent to the loudspeaker"
+        )
+    return y, x

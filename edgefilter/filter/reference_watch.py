@@ -13,9 +13,11 @@ from edgefilter.alignment.delay_line import Aligned, Tape
 from edgefilter.alignment.lag_search import CERTAIN, WINDOW, LagSearch
 from edgefilter.alignment.utterances import FLOOR, OnsetDetector
 from edgefilter.dsp import fourier
+from edgefilter.dsp.lag import one_signal
 from edgefilter.filter.microphones import SILENT
 from edgefilter.filter.removal import Removal
 from edgefilter.filter.robot_sound import LOUD, RobotSound
+from edgefilter.filter.volume import pre_emphasised
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, EventKind, Frame, Samples
 
 LATEST = SAMPLE_RATE
@@ -37,9 +39,8 @@ MISSING, HEARD = 60 * SAMPLE_RATE, 10 * SAMPLE_RATE
 converter, since there is nothing else to compare with. 16 bits by themselves are 41 dB softer."""
 FELL_SILENT = 1e-3
 """Power of the reference, over its power while the robot talks, below which it is silent, -30 dB: the noise of a loopback is."""
-SAME, SAME_S = 0.999, 2.0
-"""Squared correlation coefficient of microphone and reference at lag 0, over so many seconds of sound, from which on they are
-one signal: sound needs some samples to a microphone, and a room and its noise leave less than -30 dB nowhere."""
+SAME_S = 2.0
+"""Seconds of sound after which microphone and reference are compared sample by sample."""
 Verdict = Literal["unknown", "fits", "late"]
 
 
@@ -51,7 +52,7 @@ class ReferenceWatch:
     earlier utterance, whose echo the microphone may still hear: so what is found there must not be found as well, at the
     same lag, in the reference that the aligner has delayed. hop: samples a step. bins: of a spectrum. verdict: "unknown"
     until an utterance was found by either, or by neither for long; "fits" and "late" then. without: whether the robot is
-    heard while the reference is silent.
+    heard while the reference is silent. same: whether microphone and reference are one signal.
 
     >>> watch = ReferenceWatch(256, 257)
     >>> watch.verdict, watch.wait
@@ -64,7 +65,7 @@ class ReferenceWatch:
         self._mic, self._ref, self._earlier = (Tape(self._search.span) for _ in range(3))
         self._onsets = OnsetDetector(hop)
         self.verdict: Verdict = "unknown"
-        self.without = False
+        self.without = self.same = False
         self._late = self._stage = self._looks = 0
         self._to_search = SEARCH_STRIDE
         self._idle = True
@@ -105,7 +106,7 @@ class ReferenceWatch:
         checks: tuple[tuple[EventKind, str], ...] = (
             ("robot_unfound", self._weigh(power, aligned)),
             ("echo_unpredicted", self._unpredicted(removal)),
-            ("same_signal", self._same(float(mic.dot(ref)) / self._hop, power, played)),
+            ("same_signal", self._same(pre_emphasised(mic), pre_emphasised(ref))),
             (
                 "reference_missing",
                 self._wait_for_any(power, played) or self._listen_without(played, aligned, frame, speaking),
@@ -121,23 +122,25 @@ class ReferenceWatch:
 
     def _unpredicted(self, removal: Removal) -> str:
         """Say that hardly anything of the robot can be subtracted."""
-        if not removal.unpredicted or not self._once("unpredicted"):
+        if not removal.unpredicted or self.verdict == "late" or not self._once("unpredicted"):
             return ""
         return (
-            f"the linear stage removes {removal.removed_db:.1f} dB of the robot: the microphone seems to be processed, or"
-            " the loudspeaker distorts; switch off noise suppression, gain control and echo cancellation of the device,"
-            " and turn the volume down"
+            f"the linear stage removes {removal.removed_db:.1f} dB of the robot: the microphone seems to be processed, the"
+            " loudspeaker distorts, or the reference is of another recording; switch off noise suppression, gain control and"
+            " echo cancellation of the device, and turn the volume down"
         )
 
-    def _same(self, cross: float, power: float, played: float) -> str:
-        """Add up the products of both channels until they hold enough sound to tell whether they are one signal."""
-        if min(power, played) > FLOOR:
-            self._products += cross, power, played
+    def _same(self, mic: Samples, ref: Samples) -> str:
+        """Add up products of both channels until they hold enough sound to tell whether they are one signal."""
+        products = float(mic.dot(ref)), float(mic.dot(mic)), float(ref.dot(ref))
+        if min(products[1:]) > FLOOR * self._hop:
+            self._products += products
             self._sounding += self._hop
         if self._sounding < SAME_S * SAMPLE_RATE:
             return ""
-        (cross, power, played), self._products, self._sounding = self._products, np.zeros(3), 0
-        if cross**2 <= SAME * power * played or not self._once("same"):
+        self.same = one_signal(*self._products)
+        self._products, self._sounding = np.zeros(3), 0
+        if not self.same or not self._once("same"):
             return ""
         return (
             "the microphone and the reference are the same signal: all of it is taken for the robot and removed; give the"

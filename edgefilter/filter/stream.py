@@ -166,7 +166,7 @@ class Stream:
         out = self._step(mic, ref)
         if self.stepping and (happened := self.stepping.note(self.stepping.clock() - began)):
             self._tell(*happened)
-        if self.learner and self.front.linear_stage:
+        if self.learner and self.front.linear_stage and not (self._watch and self._watch.same):
             self.front.linear_stage.learn()
         return out
 

@@ -1,0 +1,87 @@
+"""A run ends with what it came to, and says what was wrong; files that cannot be meant are refused with the likely cause."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+import edgefilter
+from edgefilter.cli import main
+from edgefilter.commands.run import verdict_lines
+from edgefilter.session import Verdict
+
+DEMO = Path(edgefilter.__file__).parent / "demo_data"
+RATE = 16_000
+
+
+@pytest.fixture
+def files(tmp_path):
+    """The bundled robot alone, 9 s of it twice, and its reference backwards."""
+    mic, ref = (np.tile(soundfile.read(DEMO / f"{name}.flac")[0][: 9 * RATE], 2) for name in ("mic", "reference"))
+    for name, sound in (("mic", mic), ("ref", ref), ("other", ref[::-1])):
+        soundfile.write(tmp_path / f"{name}.wav", sound, RATE)
+    return tmp_path
+
+
+def ran(files, mic, ref, capsys, *more):
+    names = [str(files / f"{name}.wav") for name in (mic, ref, "out")]
+    words = ["run", "--input", names[0], "--reference", names[1], "--output", names[2], "--json", str(files / "o.json")]
+    assert main([*words, *more]) == 0
+    return json.loads((files / "o.json").read_text()), capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_run_says_how_much_of_the_robot_was_removed_at_which_lag_and_how_often_a_human_was_noticed(files, capsys):
+    figures, told = ran(files, "mic", "ref", capsys, "--engine", "crnn")
+    verdict = figures["verdict"]
+    assert verdict["removed_db"] > 15.0 and verdict["lag_ms"] == pytest.approx(352, abs=3)
+    assert verdict["noticed"] == 0 and verdict["wrong"] == []
+    assert (
+        "lowered by" in told and "352 ms after the reference; a human was noticed never" in told and "wrong" not in told
+    )
+
+
+@pytest.mark.slow
+def test_a_reference_of_another_recording_is_said_at_the_end(files, capsys):
+    figures, told = ran(files, "mic", "other", capsys, "--engine", "linear", "--no-learn")
+    assert figures["verdict"]["lag_ms"] is None and len(figures["verdict"]["wrong"]) == 1
+    assert "wrong: the reference" in told or "wrong: the microphone" in told
+
+
+@pytest.mark.slow
+def test_one_file_given_twice_is_said_and_nothing_is_learned_from_it(files, capsys):
+    figures, told = ran(files, "ref", "ref", capsys, "--engine", "linear")
+    assert "same signal" in figures["verdict"]["wrong"][0] and "learned path" not in told
+    assert figures["learning"]["learned"] == 0
+
+
+def test_a_verdict_in_words():
+    assert verdict_lines(Verdict(31.25, 98.4, 1, ())) == [
+        "the robot alone was lowered by 31.2 dB, heard 98 ms after the reference; a human was noticed once"
+    ]
+    assert verdict_lines(Verdict(None, None, None, ("it is late",))) == ["wrong: it is late"]
+    assert verdict_lines(Verdict(3.0, None, 4, ()))[0].endswith("lowered by 3.0 dB; a human was noticed 4 times")
+
+
+@pytest.mark.parametrize("command", ["compare", "diagnose", "passport"])
+def test_one_file_given_twice_is_refused_with_the_likely_cause(files, command, capsys):
+    profile = [] if command == "passport" else ["--profile", str(DEMO / "profile.npz")]
+    names = ["--recording", str(files / "mic.wav"), "--reference", str(files / "mic.wav")]
+    assert main([command, *profile, *names]) == 1
+    (line,) = [each for each in capsys.readouterr().err.splitlines() if each.startswith("edgefilter: ")]
+    assert "same signal" in line and "loudspeaker" in line
+
+
+@pytest.mark.parametrize("command", ["compare", "diagnose"])
+def test_an_unrelated_reference_is_refused(files, command, capsys):
+    names = ["--recording", str(files / "mic.wav"), "--reference", str(files / "other.wav")]
+    assert main([command, "--profile", str(DEMO / "profile.npz"), *names]) == 1
+    assert "does not contain the reference" in capsys.readouterr().err
+
+
+def test_swapped_files_are_asked_about(files, capsys):
+    names = ["--recording", str(files / "ref.wav"), "--reference", str(files / "mic.wav")]
+    assert main(["compare", "--profile", str(DEMO / "profile.npz"), *names]) == 0
+    assert "are the two swapped" in capsys.readouterr().out
