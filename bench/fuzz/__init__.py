@@ -155,7 +155,7 @@ def attempt(target: Target, path: Path, rng: random.Random) -> str:
         return "taken"
     except EdgefilterError as error:
         line = str(error)
-        return "refused" if line and "\n" not in line and len(line) < LONGEST else f"no single line: {line[:200]!r}"
+        return "refused" if line.isprintable() and 0 < len(line) < LONGEST else f"no single line: {line[:200]!r}"
     except Hang:
         return f"more than {PATIENCE_S} s"
     except Exception as error:
