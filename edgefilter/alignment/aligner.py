@@ -100,8 +100,8 @@ class Aligner:
         A sound in the reference channel is the reference, and drops announcements. While there is none, the announced
         utterance is looked for in the microphone for 30 s, and from where it is heard on it is the reference.
         """
-        self._counts["announced"] += 1
         self._announced.add(utterance)
+        self._counts["announced"] += 1
 
     def step(self, mic: Samples, ref: Samples) -> Aligned:
         """Take the next hop (hop,) of microphone and reference, of an array (microphones, hop)."""

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgefilter.dsp.frames import SILENT, stretch
+from edgefilter.errors import SignalError
 from edgefilter.types import SAMPLE_RATE, AlignmentState, Samples
 
 PAUSE = SAMPLE_RATE // 5
@@ -28,6 +29,8 @@ AHEAD = 4096
 """Samples by which an utterance that was heard goes ahead of the microphone, so that the tracker sees to both sides."""
 PATIENCE = 30 * SAMPLE_RATE
 """Samples of silence for which an announced utterance is waited for."""
+MOST_ANNOUNCED, MOST_ANNOUNCED_S = 64, 300
+"""Utterances that may wait, and seconds of them, 19 MB: longer than any answer, also where each word is announced apart."""
 LOUD, EXPLAINED = 0.05, 100.0
 """Microphone power from which on it can only be the robot, over the robot's loudest there; a human 20-26 dB below it is 7 to
 13 dB softer. Microphone power, over that of the echo at the present delay, from which on this delay is not the right one;
@@ -134,10 +137,21 @@ class Announcements:
         self._since: int | None = None
 
     def add(self, utterance: Samples) -> None:
-        """Queue an utterance (n,); the silence before its first sound does not count, and one without any sound is left out."""
+        """Queue an utterance (n,); the silence before its first sound does not count, and one without any sound is left out.
+
+        Raises SignalError, and queues nothing, where more would wait than may.
+        """
         loud = np.flatnonzero(np.abs(utterance) > max(0.01 * float(np.abs(utterance).max(initial=0.0)), FLOOR**0.5))
-        if loud.size:
-            self._waiting.append(np.array(utterance[max(loud[0] - 256, 0) : loud[-1] + 1], np.float32))
+        if not loud.size:
+            return
+        sound = utterance[max(loud[0] - 256, 0) : loud[-1] + 1]
+        seconds = sum(map(len, (*self._waiting, sound))) / SAMPLE_RATE
+        if len(self._waiting) >= MOST_ANNOUNCED or seconds > MOST_ANNOUNCED_S:
+            raise SignalError(
+                f"{len(self._waiting) + 1} utterances of {seconds:.0f} s are announced and not heard yet, expected at most"
+                f" {MOST_ANNOUNCED} of {MOST_ANNOUNCED_S} s: announce an utterance when the one before it begins"
+            )
+        self._waiting.append(np.array(sound, np.float32))
 
     def reference(self, ref: Samples, now: int) -> Samples:
         """The reference (n,) for the hop that begins at position now: the channel's own, or what is being played."""

@@ -211,7 +211,8 @@ class EgoFilter:
         Raises
         ------
         SignalError
-            For another shape or dtype, or samples that are not finite or beyond 1e6.
+            For another shape or dtype, samples that are not finite or beyond 1e6, and where more than 64 utterances
+            or five minutes would wait to be heard: then this one is not announced.
 
         Notes
         -----

@@ -188,7 +188,11 @@ class Profile:
                 refuse("warnings", f"a JSON {type(warnings).__name__}", "a list of texts")
             told = tuple(printable(text) if isinstance(text, str) else text for text in warnings)
             texts = {name: printable(value) if isinstance(value, str) else value for name, value in header.items()}
-            fields: dict[str, Any] = {**arrays, **texts, "warnings": told}  # what type each has is checked on construction
+            fields: dict[str, Any] = {
+                **arrays,
+                **texts,
+                "warnings": told,
+            }  # what type each has is checked on construction
             echo = EchoModel(fields.pop("impulse_response"), effects)
             profile = cls(echo=echo, approximation=approximation, array=array, **fields)
             _check_effects(echo)

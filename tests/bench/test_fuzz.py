@@ -37,7 +37,9 @@ def test_an_input_is_refused_in_one_line_or_a_find(tmp_path: Path) -> None:
 
         return fuzz.Target("x", 1, ".x", list, lambda data, rng: data, attempt)
 
-    said = [fuzz.attempt(refuses(text), tmp_path, fuzz.generator(0, 0)) for text in ("no", "x" * fuzz.LONGEST, "by zero")]
+    said = [
+        fuzz.attempt(refuses(text), tmp_path, fuzz.generator(0, 0)) for text in ("no", "x" * fuzz.LONGEST, "by zero")
+    ]
     assert (
         said[0] == "refused"
         and said[1].startswith("no single line")
