@@ -255,8 +255,8 @@ class Service:
         _LOGGER.warning("client %s: %s; its connection is closed", connection.remote_address, why)
         try:
             await asyncio.wait_for(connection.send(_text("error", detail=why)), PATIENCE_S)
-            # RFC 6455, 5.5: 125 bytes with the code
-            await connection.close(1008, why.encode()[:120].decode(errors="ignore"))
+            _refuse(connection, why)
+            await asyncio.wait_for(connection.wait_closed(), PATIENCE_S)
         except (ConnectionClosed, TimeoutError, asyncio.TimeoutError):
             connection.transport.abort()
 
@@ -348,8 +348,7 @@ class _Connection(ServerConnection):
         super().process_event(event)
         self._pings = self._pings + 1 if getattr(event, "opcode", 0) >= Opcode.CLOSE else 0
         if self._pings == MOST_PINGS:
-            self.protocol.fail(1008, f"{MOST_PINGS} pings without a message: send sound")
-            self.send_data()
+            _refuse(self, f"{MOST_PINGS} pings without a message: send sound")
 
     def data_received(self, data: bytes) -> None:
         super().data_received(data)
@@ -376,6 +375,14 @@ async def _message(connection: ServerConnection, patience_s: float) -> bytes | s
         return await asyncio.wait_for(whole(), patience_s)
     except (TimeoutError, asyncio.TimeoutError):
         raise SignalError(f"nothing was heard for {patience_s:.0f} s: send sound, or end the session") from None
+
+
+def _refuse(connection: ServerConnection, why: str) -> None:
+    """Close with a word; what still comes is read, so that the word is not lost, and forgotten."""
+    # RFC 6455, 5.5: 125 bytes with the code
+    connection.protocol.fail(1008, why.encode()[:120].decode(errors="ignore"))
+    connection.send_data()
+    connection.transport.resume_reading()
 
 
 def _let_go(connection: ServerConnection) -> None:
