@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgefilter.dsp.frames import SILENT, stretch
-from edgefilter.errors import SignalError
 from edgefilter.types import SAMPLE_RATE, AlignmentState, Samples
 
 PAUSE = SAMPLE_RATE // 5
@@ -136,22 +135,19 @@ class Announcements:
         self._playing: Playback | None = None
         self._since: int | None = None
 
-    def add(self, utterance: Samples) -> None:
+    def add(self, utterance: Samples) -> bool:
         """Queue an utterance (n,); the silence before its first sound does not count, and one without any sound is left out.
 
-        Raises SignalError, and queues nothing, where more would wait than may.
+        False, and nothing is queued, where more would wait than may.
         """
         loud = np.flatnonzero(np.abs(utterance) > max(0.01 * float(np.abs(utterance).max(initial=0.0)), FLOOR**0.5))
-        if not loud.size:
-            return
-        sound = utterance[max(loud[0] - 256, 0) : loud[-1] + 1]
-        seconds = sum(map(len, (*self._waiting, sound))) / SAMPLE_RATE
-        if len(self._waiting) >= MOST_ANNOUNCED or seconds > MOST_ANNOUNCED_S:
-            raise SignalError(
-                f"{len(self._waiting) + 1} utterances of {seconds:.0f} s are announced and not heard yet, expected at most"
-                f" {MOST_ANNOUNCED} of {MOST_ANNOUNCED_S} s: announce an utterance when the one before it begins"
-            )
-        self._waiting.append(np.array(sound, np.float32))
+        sound = utterance[max(loud[0] - 256, 0) : loud[-1] + 1] if loud.size else utterance[:0]
+        waiting = sum(map(len, (*self._waiting, sound)))
+        if len(self._waiting) >= MOST_ANNOUNCED or waiting > MOST_ANNOUNCED_S * SAMPLE_RATE:
+            return False
+        if sound.size:
+            self._waiting.append(np.array(sound, np.float32))
+        return True
 
     def reference(self, ref: Samples, now: int) -> Samples:
         """The reference (n,) for the hop that begins at position now: the channel's own, or what is being played."""

@@ -522,8 +522,12 @@ HOARDS = {
     "large numbers that skip": ({"streams": "two"}, skipping(2, 3_900_000), "bytes wait for other messages"),
     "references before any microphone": ({"streams": "two"}, references(3_900_000), "bytes wait for other messages"),
     "a reference that runs ahead": ({"streams": "two"}, [HEADER.pack(0, 0, 0), *references(400_000)], "bytes wait"),
-    "announcements": ({}, ANNOUNCED * 300, "expected at most 64 of 300 s"),
-    "announcements of a word": ({}, [ANNOUNCED[0], pcm(np.full(100, 0.1))] * 300, "expected at most 64 of 300 s"),
+    "announcements": ({}, ANNOUNCED * 300, "more than 64 utterances or 300 s would"),
+    "announcements of a word": (
+        {},
+        [ANNOUNCED[0], pcm(np.full(100, 0.1))] * 300,
+        "more than 64 utterances or 300 s would",
+    ),
 }
 """What a client sends that wants to be kept: its first message, the others, and what it is told."""
 
