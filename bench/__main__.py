@@ -8,7 +8,7 @@ live       trials on virtual devices: conversations, barge-in, an hour without a
 diagnosis  how often hidden effects are named, and what naming them brings
 training   what chooses a network: words on validation speakers, the scale of the speech probability
 serve      streams that a core serves in real time
-fuzz       damaged profiles, models and recordings
+fuzz       damaged profiles, models and recordings; hostile clients
 mutate     whether the tests notice a change in the code
 count      lines, and numbers that have a name, by folder
 stale      which results are of another behaviour than today's; exit 1 if there are any

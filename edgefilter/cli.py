@@ -21,7 +21,7 @@ from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.echo.effects.catalogue import names
 from edgefilter.echo.user_effects import load_effect
 from edgefilter.engines import ENGINES, HAVE_MODEL
-from edgefilter.errors import EdgefilterError, UsageError
+from edgefilter.errors import EdgefilterError, UsageError, printable
 from edgefilter.types import ALL_CHANNELS, MOST_MICROPHONES
 
 ENGINE = {
@@ -473,7 +473,7 @@ def _forget_output() -> None:
 def _fail(error: object, code: int, debug: bool) -> int:
     if debug:
         raise error if isinstance(error, BaseException) else RuntimeError(error)
-    print(f"edgefilter: {' '.join(str(error).split())}", file=sys.stderr)
+    print(f"edgefilter: {printable(error)}", file=sys.stderr)
     return code
 
 

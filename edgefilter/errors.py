@@ -1,11 +1,28 @@
 """The error tree. Each message says what is wrong, what was found, what was expected and what to do, in one line."""
 
+from __future__ import annotations
+
+
+def printable(text: object, most: int | None = None) -> str:
+    r"""Make one line of what others wrote (a file, a client, a library): blanks for white space, what controls a terminal escaped.
+
+    most: characters.
+
+    >>> printable("\x1b[2J\n a name", 12)
+    '\\x1b[2J a na'
+    """
+    line = " ".join(str(text).split())
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)[:most]
+
 
 class EdgefilterError(Exception):
-    """Base of every error that this package raises on purpose.
+    """Base of every error that this package raises on purpose; as text one line, whatever names and values it quotes.
 
     The command line turns it into one line and exit code 1.
     """
+
+    def __str__(self) -> str:
+        return printable(super().__str__())
 
 
 class UsageError(EdgefilterError):

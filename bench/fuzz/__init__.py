@@ -1,6 +1,7 @@
 """Damaged files by the million: loaders refuse them in one line, and what they accept keeps the filter's promises.
 
     OMP_NUM_THREADS=1 python -m bench fuzz --inputs 1000000 --minutes 60 --output bench/results/fuzz
+    OMP_NUM_THREADS=1 python -m bench fuzz --clients --minutes 10       (bench/fuzz/clients.py)
 
 Each input is a real file damaged at random, a pure function of seed and number: `--start NUMBER --inputs 1` makes one
 again. A find is a file that is not refused by one EdgefilterError of one line, that breaks a promise after it was taken,
@@ -74,18 +75,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--inputs", type=int, default=1_000_000, help="default: %(default)s")
     add("--start", type=int, default=0, metavar="NUMBER", help="of the first input")
-    add("--minutes", type=float, default=1e6, help="stop after so many")
+    add(
+        "--minutes",
+        type=float,
+        help="stop after so many (default: with --clients 10, otherwise when all inputs are done)",
+    )
+    add("--clients", action="store_true", help="hostile clients of the services, in place of damaged files")
     add("--only", choices=[target.name for target in TARGETS], help="one loader alone")
     add("--keep", type=Path, metavar="DIR", help="keep the files that were finds")
 
 
 def run(options: argparse.Namespace) -> str:
     """Start loading processes until all is done; one that dies is a find, and the next begins behind it."""
+    if options.clients:
+        from bench.fuzz import clients
+
+        options.minutes = 10.0 if options.minutes is None else options.minutes
+        return clients.run(options)
     made_with = results.stamp({"DEMO": [DEMO], "NETWORKS": [NETWORKS]})
     context = multiprocessing.get_context("spawn")
     number, counts = context.Value("q", options.start), context.Array("q", len(TARGETS) * len(COLUMNS))
     began, at, end, deaths = time.time(), options.start, options.start + options.inputs, []
-    until = began + 60 * options.minutes
+    until = began + 60 * (1e6 if options.minutes is None else options.minutes)
     with tempfile.TemporaryDirectory(dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else None) as name:
         folder = Path(name)
         while at < end and time.time() < until:
@@ -155,7 +166,7 @@ def attempt(target: Target, path: Path, rng: random.Random) -> str:
         return "taken"
     except EdgefilterError as error:
         line = str(error)
-        return "refused" if line and "\n" not in line and len(line) < LONGEST else f"no single line: {line[:200]!r}"
+        return "refused" if line.isprintable() and 0 < len(line) < LONGEST else f"no single line: {line[:200]!r}"
     except Hang:
         return f"more than {PATIENCE_S} s"
     except Exception as error:

@@ -95,14 +95,16 @@ class Aligner:
         if self._responses is not None and self._used[0] != first:
             self._meter = DelayMeter(self._responses[self._used[0]])
 
-    def announce(self, utterance: Samples) -> None:
+    def announce(self, utterance: Samples) -> bool:
         """Say what will be played (n,); it may begin at any time or never, and several are played in the order of announcing.
 
         A sound in the reference channel is the reference, and drops announcements. While there is none, the announced
         utterance is looked for in the microphone for 30 s, and from where it is heard on it is the reference.
+        False where too many wait already: then it is not announced.
         """
-        self._counts["announced"] += 1
-        self._announced.add(utterance)
+        kept = self._announced.add(utterance)
+        self._counts["announced"] += kept
+        return kept
 
     def step(self, mic: Samples, ref: Samples) -> Aligned:
         """Take the next hop (hop,) of microphone and reference, of an array (microphones, hop)."""

@@ -47,8 +47,9 @@ class PaperAligner:
         self._decided = 0
         self._begin(None)
 
-    def announce(self, utterance: Samples) -> None:
+    def announce(self, utterance: Samples) -> bool:
         """Accepted and not needed: the reference itself comes before the microphone hears it."""
+        return True
 
     def step(self, mic: Samples, ref: Samples) -> Aligned:
         """Take a hop (hop,) of both and return the reference as the microphone hears it."""

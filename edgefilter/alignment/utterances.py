@@ -28,6 +28,8 @@ AHEAD = 4096
 """Samples by which an utterance that was heard goes ahead of the microphone, so that the tracker sees to both sides."""
 PATIENCE = 30 * SAMPLE_RATE
 """Samples of silence for which an announced utterance is waited for."""
+MOST_ANNOUNCED, MOST_ANNOUNCED_S = 64, 300
+"""Utterances that may wait, and seconds of them, 19 MB: longer than any answer, also where each word is announced apart."""
 LOUD, EXPLAINED = 0.05, 100.0
 """Microphone power from which on it can only be the robot, over the robot's loudest there; a human 20-26 dB below it is 7 to
 13 dB softer. Microphone power, over that of the echo at the present delay, from which on this delay is not the right one;
@@ -133,11 +135,19 @@ class Announcements:
         self._playing: Playback | None = None
         self._since: int | None = None
 
-    def add(self, utterance: Samples) -> None:
-        """Queue an utterance (n,); the silence before its first sound does not count, and one without any sound is left out."""
+    def add(self, utterance: Samples) -> bool:
+        """Queue an utterance (n,); the silence before its first sound does not count, and one without any sound is left out.
+
+        False, and nothing is queued, where more would wait than may.
+        """
         loud = np.flatnonzero(np.abs(utterance) > max(0.01 * float(np.abs(utterance).max(initial=0.0)), FLOOR**0.5))
-        if loud.size:
-            self._waiting.append(np.array(utterance[max(loud[0] - 256, 0) : loud[-1] + 1], np.float32))
+        sound = utterance[max(loud[0] - 256, 0) : loud[-1] + 1] if loud.size else utterance[:0]
+        waiting = sum(map(len, (*self._waiting, sound)))
+        if len(self._waiting) >= MOST_ANNOUNCED or waiting > MOST_ANNOUNCED_S * SAMPLE_RATE:
+            return False
+        if sound.size:
+            self._waiting.append(np.array(sound, np.float32))
+        return True
 
     def reference(self, ref: Samples, now: int) -> Samples:
         """The reference (n,) for the hop that begins at position now: the channel's own, or what is being played."""

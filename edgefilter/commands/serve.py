@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import ipaddress
 import signal
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.budget import allowed_cores
 from edgefilter.filter.ego_filter import EgoFilter
+from edgefilter.integrations.doors import is_own
 from edgefilter.learning.background import BackgroundLearner
 from edgefilter.profile.data import Profile
 
@@ -74,11 +74,3 @@ def read_token(path: str) -> str:
             f"--token {path} holds {len(token)} characters, expected 16 or more of ASCII: openssl rand -hex 24"
         )
     return token
-
-
-def is_own(host: str) -> bool:
-    """Whether only this machine reaches it."""
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False

@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from edgefilter.dsp.stft import StftConfig
-from edgefilter.errors import ModelError, StftError
+from edgefilter.engines.onnx_graph import refusal
+from edgefilter.errors import ModelError, StftError, printable
 from edgefilter.types import SAMPLE_RATE
 
 try:
@@ -32,9 +33,8 @@ SHIPPED = {
 """sha256 of the files in models/, as MODELS.md lists them."""
 MOST_BYTES, MOST_STATE, MOST_FFT = 512 * 2**20, 1 << 22, 1 << 14
 """Bounds on what a file may ask for: its own size, the values in one state tensor (16 MiB), the longest transform (1 s)."""
-OTHER_FILES = b"location"
-"""The key (ExternalDataProto of onnx.proto) without which no tensor can name another file; onnxruntime before 1.24 opens
-any path there, and 1.32 those below the working directory."""
+TOLD = 160
+"""Characters of what a library says that are told: the first line of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +87,8 @@ def open_session(path: Path, content: bytes | None = None) -> onnxruntime.Infere
     """A session on one core: frames are too small to share, and a second thread that spins costs a whole core.
 
     content: of the file, where it was read before. Denormal numbers count as zero in the thread that makes the session.
-    Raises ModelError for what is no ONNX model, asks for operators of other libraries, or has weights in other files.
+    Raises ModelError for what is no ONNX model, and before anything opens it for functions, loops and branches, operators of
+    other libraries and weights in other files.
     """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -96,17 +97,21 @@ def open_session(path: Path, content: bytes | None = None) -> onnxruntime.Infere
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
     options.add_session_config_entry("session.set_denormal_as_zero", "1")
     content = _read(path) if content is None else content
-    if OTHER_FILES in content:
-        raise ModelError(f"model {path} takes its weights from other files, expected them inside: export it again")
+    # its own format, which would be taken for this one, is not read beforehand
+    options.add_session_config_entry("session.load_model_format", "ONNX")
     try:
+        if wrong := refusal(content):
+            raise ModelError(f"model {path} {wrong}: export it again")
         # a fallback would print, and try the same again
         session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"], enable_fallback=0)
         for slot in (*session.get_inputs(), *session.get_outputs()):
             _ = slot.name, slot.shape  # text that is none fails here rather than later
         _ = session.get_modelmeta().custom_metadata_map
         return session
+    except ModelError:
+        raise
     except Exception as error:  # onnxruntime's exceptions share no base of their own
-        raise ModelError(f"model {path} cannot be loaded ({plain(str(error))}): export it again") from None
+        raise ModelError(f"model {path} cannot be loaded ({printable(error, TOLD)}): export it again") from None
 
 
 def open_model(path: Path, kind: str, version: int) -> Model:
@@ -117,7 +122,7 @@ def open_model(path: Path, kind: str, version: int) -> Model:
     for key, wanted in (("type", kind), ("version", str(version)), ("sample_rate", str(SAMPLE_RATE))):
         if (found := said.get(key)) != wanted:
             raise ModelError(
-                f"model {path} has {key} {plain(found or 'unknown', 40)}, expected {wanted}: take the model that belongs"
+                f"model {path} has {key} {printable(found or 'unknown', 40)}, expected {wanted}: take the model that belongs"
                 " to this engine and version"
             )
     try:
@@ -135,7 +140,7 @@ def open_model(path: Path, kind: str, version: int) -> Model:
     except KeyError as error:
         raise ModelError(f"model {path} does not say its {error.args[0]}: export it again") from None
     except (ValueError, TypeError, StftError, RecursionError, OverflowError) as error:
-        raise ModelError(f"model {path} has unusable metadata ({plain(str(error))}): export it again") from None
+        raise ModelError(f"model {path} has unusable metadata ({printable(error, TOLD)}): export it again") from None
     return Model(path, hashlib.sha256(content).hexdigest(), session, stft, training, figures, states)
 
 
@@ -149,7 +154,7 @@ def expect_slots(model: Model, inputs: Mapping[str, tuple], outputs: Mapping[str
         fits = found.keys() == wanted.keys() and all(_may_be(shape, wanted[name]) for name, shape in found.items())
         if not fits:
             said, expected = (
-                plain(", ".join(f"{name} {list(shape)}" for name, shape in sorted(each.items())), 400)
+                printable(", ".join(f"{name} {list(shape)}" for name, shape in sorted(each.items())), 400)
                 for each in (found, wanted)
             )
             raise ModelError(f"model {model.path} has {word} {said}, its metadata wants {expected}: export it again")
@@ -160,14 +165,9 @@ def expect_answer(path: Path, answer: Callable[[], Iterable[np.ndarray]]) -> Non
     try:
         found = answer()
     except Exception as error:  # onnxruntime's own, or numpy's of shapes that cannot be
-        raise ModelError(f"model {path} cannot be run ({plain(str(error))}): export it again") from None
+        raise ModelError(f"model {path} cannot be run ({printable(error, TOLD)}): export it again") from None
     if not all(np.isfinite(part).all() for part in found):
         raise ModelError(f"model {path} answers with values that are not finite: train it again")
-
-
-def plain(text: str, most: int = 160) -> str:
-    """What a file or a library says, fit for one line."""
-    return " ".join(text.split())[:most]
 
 
 def _read(path: Path) -> bytes:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from edgefilter import engines
+from edgefilter.alignment.utterances import MOST_ANNOUNCED, MOST_ANNOUNCED_S
 from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.engines.combined import Ladder, climbable, judges_speech, with_network_as_judge
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
@@ -211,7 +212,8 @@ class EgoFilter:
         Raises
         ------
         SignalError
-            For another shape or dtype, or samples that are not finite or beyond 1e6.
+            For another shape or dtype, samples that are not finite or beyond 1e6, and where more than 64 utterances
+            or five minutes would wait to be heard: then this one is not announced.
 
         Notes
         -----
@@ -219,8 +221,12 @@ class EgoFilter:
         microphone for 30 s, and from about 0.1 s after its first sound on it is the reference. A reference channel that
         carries sound is believed instead, and drops what was announced. paper-ss counts announcements.
         """
-        if self._stream.front.aligner:
-            self._stream.front.aligner.announce(as_samples(utterance, "utterance"))
+        aligner = self._stream.front.aligner
+        if aligner and not aligner.announce(as_samples(utterance, "utterance")):
+            raise SignalError(
+                f"announced speech waits to be heard, and with this more than {MOST_ANNOUNCED} utterances or"
+                f" {MOST_ANNOUNCED_S} s would, expected fewer: announce an utterance when the one before it begins"
+            )
 
     def events(self) -> list[Event]:
         """What happened since the last call.

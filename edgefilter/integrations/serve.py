@@ -11,12 +11,15 @@ import http
 import json
 import logging
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import chain
+from typing import Any, cast
 
 import numpy as np
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
+from websockets.frames import Opcode
 from websockets.http11 import Request, Response
 
 from edgefilter.audio.raw import of_pcm16
@@ -24,20 +27,38 @@ from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import EdgefilterError, SignalError
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.integrations.channels import taken
+from edgefilter.integrations.doors import complain_briefly, in_one_line
 from edgefilter.integrations.duplex import Pace, as_pcm16, from_pcm16
 from edgefilter.integrations.wire import Decode, Form, TwoStreams, message_of
 from edgefilter.types import SAMPLE_RATE, SET_UP_WRONG, Event, Samples
 
 MOST_BYTES = 4_000_000
 """Size of a message: an announced utterance of 40 s at 48 kHz; of sound some 20 ms are usual."""
-PATIENCE_S = 5.0
-"""For how long a client may take for its first message, and for reading an answer."""
+PART_S = 0.02
+"""Sound that is filtered before other clients have their turn: what a message usually holds."""
+AHEAD_S, BEHIND_S, TURNS = 0.1, 2.0, 10
+"""Sound that may come before its time, five messages, or after it, what networks hold up, and is filtered at once. What is
+ahead of that waits, one client after the other, so many turns of the event loop a part: in five a message of 20 ms, which is
+due, goes all its way."""
+PATIENCE_S, IDLE_S = 5.0, 60.0
+"""For how long a client may take for its handshake, its first message, and reading an answer; and for any later message."""
+READ_AT_ONCE, MOST_FRAMES = 4096, 1000
+"""Bytes that are read of a client before others have their turn, 20 ms of two channels at 48 kHz: in frames without
+content, of 6 bytes, these take 5 ms. And frames of a message, of at least that size where it is of MOST_BYTES."""
+MOST_PINGS, MOST_UNREAD = 100, 1 << 16
+"""Pings in a row without a message, which no pause between messages makes useful; bytes of answers to them and others that
+wait in this process for a client to read."""
+GUESTS = 16
+"""Connections that have no stream yet, or none any more; where one more comes, the oldest of them is cut off."""
 _LOGGER = logging.getLogger(__name__)
 Answer = bytes | str
 
 
 class Session:
-    """One client's stream: its messages in, what is to be sent to it out; no network. form: its first message. ego: its own."""
+    """One client's stream: its messages in, what is to be sent to it out; no network.
+
+    form: its first message. ego: its own. ended: whether its last answer was given.
+    """
 
     def __init__(self, form: Form, ego: EgoFilter) -> None:
         self.form, self.ego = form, ego
@@ -59,7 +80,8 @@ class Session:
         late = round(form.late_ms * rate / 1000)
         self._two = TwoStreams(*decoders, rate, late) if form.streams == "two" else None
         self.delay_ms = 1000 * (ego.latency / SAMPLE_RATE + self._to_filter[0].delay_s + codec_s)
-        self._announced = False
+        self._announced = self._announcing = self.ended = False
+        self._due = asyncio.get_running_loop().time()
         self._counted = self._counts()
 
     def ready(self, learns: bool) -> str:
@@ -67,45 +89,70 @@ class Session:
         told = {"rate": self.form.rate, "codec": self.form.codec, "engine": self.ego.engine_name}
         return _text("ready", **told, delay_ms=round(self.delay_ms, 1), late_ms=self.form.late_ms, learn=learns)
 
-    def take(self, message: bytes | str) -> tuple[list[Answer], bool]:
-        """Take a message; what is to be answered, and whether it was the last one. Raises SignalError for one that is none."""
+    @property
+    def can_wait(self) -> bool:
+        """Whether the next part of the work is ahead of its time: more sound came than a microphone records."""
+        return self._announcing or self._due > asyncio.get_running_loop().time() + AHEAD_S
+
+    def take(self, message: bytes | str) -> Iterator[list[Answer]]:
+        """Take a message; what is to be answered, part by part. Raises SignalError for one that is none."""
         if isinstance(message, str):
             kind = message_of(message).get("kind")
             if kind == "end":
-                return self.finish(), True
-            if kind != "announce":
+                yield from self.finish()
+            elif kind != "announce":
                 raise SignalError(f"found a message of kind {kind!r}, expected 'announce' or 'end'")
-            self._announced = True
-            return [], False
-        if self._announced:
-            self._announced = False
-            whole = Resampler(self.form.rate, SAMPLE_RATE)
-            self.ego.announce(whole.push(from_pcm16(message), last=True))
-            return [], False
-        if self._two:
-            self._two.push(message)
-            mic, ref = self._two.take()
+            self._announced = kind == "announce"
+        elif self._announced:
+            self._announced, self._announcing = False, True
+            yield from self._announce(from_pcm16(message))
+            self._announcing = False
         else:
-            both = of_pcm16(message, self.form.microphones + 1)
-            mic, ref = taken(both, range(self.form.microphones)), np.ascontiguousarray(both[:, -1])
-        return self._filter(mic, ref, last=False), False
+            if self._two:
+                self._two.push(message)
+                mic, ref = self._two.take()
+            else:
+                both = of_pcm16(message, self.form.microphones + 1)
+                mic, ref = taken(both, range(self.form.microphones)), np.ascontiguousarray(both[:, -1])
+            yield from self._filter(mic, ref)
 
-    def finish(self) -> list[Answer]:
-        """The rest, and the last answer, with the figures."""
+    def finish(self) -> Iterator[list[Answer]]:
+        """The rest, and the last answer, with the figures; nothing where they were given."""
+        if self.ended:
+            return
         nothing = _microphones_of(b"", self.form.microphones), np.zeros(0, np.float32)
-        answers = self._filter(*(self._two.take(last=True) if self._two else nothing), last=True)
+        if self._two:
+            yield from self._filter(*self._two.take(last=True))
+        yield self._filter_part(*nothing, last=True)
         stats = self.ego.stats()
         figures = {name: stats[name] for name in ("samples", "engine", "array")}
-        return [*answers, _text("ended", **figures, **self._counts(), deadline=stats["deadline"])]
+        self.ended = True
+        yield [_text("ended", **figures, **self._counts(), deadline=stats["deadline"])]
 
-    def _filter(self, mic: Samples, ref: Samples, last: bool) -> list[Answer]:
+    def _announce(self, utterance: Samples) -> Iterator[list[Answer]]:
+        whole, parts = Resampler(self.form.rate, SAMPLE_RATE), []
+        size = self.form.rate // 4
+        for at in range(0, len(utterance), size):
+            yield []
+            parts.append(whole.push(utterance[at : at + size]))
+        parts.append(whole.push(utterance[:0], last=True))
+        self.ego.announce(np.concatenate(parts))
+
+    def _filter(self, mic: Samples, ref: Samples) -> Iterator[list[Answer]]:
+        if self._pace and (wrong := self._pace.note(len(mic), self.form.rate)):
+            yield [self._told(Event("rate_mismatch", self.ego.stats()["samples"], wrong))]
+        size = round(PART_S * self.form.rate)
+        for at in range(0, len(mic), size):
+            part = slice(at, min(at + size, len(mic)))
+            self._due = max(self._due, asyncio.get_running_loop().time() - BEHIND_S) + (part.stop - at) / self.form.rate
+            yield self._filter_part(mic[part], ref[part], last=False)
+
+    def _filter_part(self, mic: Samples, ref: Samples, last: bool) -> list[Answer]:
         heard, played = (each.push(x, last) for each, x in zip(self._to_filter, (mic, ref)))
         human = self.ego.process(heard, played)
         events = self.ego.events()
         if last:
             human = np.concatenate((human, self.ego.flush()))
-        if self._pace and (wrong := self._pace.note(len(mic), self.form.rate)):
-            events.append(Event("rate_mismatch", self.ego.stats()["samples"], wrong))
         answers: list[Answer] = [part for part in self._encode(human, last) if part]
         return answers + [self._told(event) for event in [*events, *self._troubles()]]
 
@@ -143,13 +190,25 @@ class Service:
     ) -> None:
         self._make, self._streams, self._learners, self._token = make_filter, streams, learners, token
         self._serving = self._learning = 0
+        self._making, self._backlog = asyncio.Lock(), asyncio.Lock()
+        self._guests: dict[ServerConnection, None] = {}
         self._conversing: set[asyncio.Task[None]] = set()
         self._stopping = asyncio.Event()
 
     async def run(self, host: str, port: int, ready: Callable[[int], None] = lambda port: None) -> None:
         """Serve until `stop`; ready: called with the port once clients may come. Raises OSError where that cannot be had."""
-        # a client that sends faster than max_queue messages are filtered is read no faster
-        limits = partial(serve, max_size=MOST_BYTES, max_queue=16, compression=None, origins=[None])
+        complain_briefly()
+        log = _LOGGER.getChild("websockets")
+        log.addFilter(in_one_line)
+        # a client that sends faster than its messages are filtered is read no faster: two wait here, the others with it
+        waits: dict[str, Any] = {
+            "max_queue": 1,
+            "open_timeout": PATIENCE_S,
+            "close_timeout": PATIENCE_S,
+            "ping_interval": None,
+        }
+        limits = partial(serve, max_size=MOST_BYTES, compression=None, origins=[None], logger=log, **waits)
+        limits = partial(limits, create_connection=partial(_Connection, self._guests), backlog=GUESTS)
         async with limits(self._greet, host, port, process_request=self._admit) as server:
             ready(int(next(iter(server.sockets)).getsockname()[1]))
             await self._stopping.wait()
@@ -163,8 +222,13 @@ class Service:
         self._stopping.set()
 
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
-        given = request.headers.get("Authorization", "")
-        if self._token is not None and not hmac.compare_digest(given.encode(), f"Bearer {self._token}".encode()):
+        given = request.headers.get_all("Authorization")
+        if len(given) > 1:
+            who = connection.remote_address
+            _LOGGER.warning("client %s: found %d Authorization headers, expected one; it is refused", who, len(given))
+            return connection.respond(http.HTTPStatus.BAD_REQUEST, "one Authorization header is expected\n")
+        said = "".join(given).encode()
+        if self._token is not None and not hmac.compare_digest(said, f"Bearer {self._token}".encode()):
             return connection.respond(http.HTTPStatus.UNAUTHORIZED, "a token is needed: Authorization: Bearer TOKEN\n")
         return None
 
@@ -173,31 +237,37 @@ class Service:
             await connection.close(1013, f"{self._streams} streams are served already: come back later")
             return
         self._serving += 1
+        self._guests.pop(connection, None)
+        why = ""
         try:
             await self._serve(connection)
-        except (EdgefilterError, TimeoutError) as error:
-            await self._send_away(connection, str(error) or f"nothing was heard for {PATIENCE_S:.0f} s")
+        except EdgefilterError as error:
+            why = str(error)
         except (ConnectionClosed, ConnectionError):
             pass  # it has gone
         finally:
             self._serving -= 1
+            self._guests[connection] = None
+        if why:  # what it held is free by now
+            await self._send_away(connection, why)
 
     async def _send_away(self, connection: ServerConnection, why: str) -> None:
         _LOGGER.warning("client %s: %s; its connection is closed", connection.remote_address, why)
         try:
             await asyncio.wait_for(connection.send(_text("error", detail=why)), PATIENCE_S)
-            # RFC 6455, 5.5: 125 bytes with the code
-            await connection.close(1008, why.encode()[:120].decode(errors="ignore"))
-        except (ConnectionClosed, TimeoutError):
+            _refuse(connection, why)
+            await asyncio.wait_for(connection.wait_closed(), PATIENCE_S)
+        except (ConnectionClosed, TimeoutError, asyncio.TimeoutError):
             connection.transport.abort()
 
     async def _serve(self, connection: ServerConnection) -> None:
-        form = Form.of(await asyncio.wait_for(connection.recv(), PATIENCE_S))
+        form = Form.of(await _message(connection, PATIENCE_S))
         learns = form.learn and self._learning < self._learners
         self._learning += learns
         ego = None
         try:
-            ego = await asyncio.to_thread(self._make, learns)
+            async with self._making:  # many at once would hold the interpreter's lock for as many turns
+                ego = await asyncio.to_thread(self._make, learns)
             session = Session(form, ego)
             await self._send(connection, deque([session.ready(learns)]))
             await self._converse(connection, session)
@@ -209,31 +279,48 @@ class Service:
                 await asyncio.to_thread(ego.close)
 
     async def _converse(self, connection: ServerConnection, session: Session) -> None:
-        """Filter message by message, in the event loop: threads would only wait for one another's interpreter lock."""
+        """Filter part by part, in the event loop: threads would only wait for one another's interpreter lock."""
         answers: deque[Answer] = deque()
+        work: Iterator[list[Answer]] = iter(())
         task = asyncio.current_task()
         assert task is not None
         self._conversing.add(task)
         try:
             if self._stopping.is_set():
                 raise asyncio.CancelledError
-            ended = False
-            while not ended:
-                more, ended = session.take(await connection.recv())
-                answers.extend(more)
-                await self._send(connection, answers)
+            while not session.ended:
+                work = session.take(await _message(connection, IDLE_S))
+                await self._work(connection, session, work, answers)
         except asyncio.CancelledError:
             if not self._stopping.is_set():
                 raise
-            answers.extend(session.finish())
-            await self._send(connection, answers)
+            await self._work(connection, session, chain(work, session.finish()), answers)
         finally:
             self._conversing.discard(task)
         await connection.close(1001 if self._stopping.is_set() else 1000)
 
+    async def _work(
+        self, connection: ServerConnection, session: Session, work: Iterator[list[Answer]], answers: deque[Answer]
+    ) -> None:
+        """Do a client's work part by part, and others' in between: first the work of those whose sound is due."""
+        await self._send(connection, answers)
+        while True:
+            if session.can_wait:
+                async with self._backlog:
+                    for _ in range(TURNS):
+                        await asyncio.sleep(0)
+                    more = next(work, None)
+            else:
+                await asyncio.sleep(0)
+                more = next(work, None)
+            if more is None:
+                return
+            answers.extend(more)
+            await self._send(connection, answers)
+
     async def _send(self, connection: ServerConnection, answers: deque[Answer]) -> None:
         """Send them in their order; a client that does not read them in time is let go."""
-        slow = asyncio.get_running_loop().call_later(PATIENCE_S, self._let_go, connection)
+        slow = asyncio.get_running_loop().call_later(PATIENCE_S, _let_go, connection)
         try:
             while answers:
                 await connection.send(answers[0])
@@ -241,9 +328,66 @@ class Service:
         finally:
             slow.cancel()
 
-    def _let_go(self, connection: ServerConnection) -> None:
-        _LOGGER.warning("client %s reads too slowly; its connection is closed", connection.remote_address)
-        connection.transport.abort()
+
+class _Connection(ServerConnection):
+    """A client's connection, of which a little is read at a time. guests: those without a stream, oldest first."""
+
+    def __init__(self, guests: dict[ServerConnection, None], *args: Any, **more: Any) -> None:
+        super().__init__(*args, **more)
+        self._guests, self._pings = guests, 0
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        # of asyncio's transports on sockets: 256 kB of frames without content take 0.3 s
+        cast(Any, transport).max_size = READ_AT_ONCE
+        super().connection_made(transport)
+        self._guests[self] = None
+        if len(self._guests) > GUESTS:
+            next(iter(self._guests)).transport.abort()
+
+    def process_event(self, event: Any) -> None:
+        super().process_event(event)
+        self._pings = self._pings + 1 if getattr(event, "opcode", 0) >= Opcode.CLOSE else 0
+        if self._pings == MOST_PINGS:
+            _refuse(self, f"{MOST_PINGS} pings without a message: send sound")
+
+    def data_received(self, data: bytes) -> None:
+        super().data_received(data)
+        if self.transport.get_write_buffer_size() > MOST_UNREAD:
+            _let_go(self)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._guests.pop(self, None)
+        super().connection_lost(exc)
+
+
+async def _message(connection: ServerConnection, patience_s: float) -> bytes | str:
+    """The next message; raises SignalError for one in too many frames, and where none comes for so long."""
+
+    async def whole() -> bytes | str:
+        parts: list[Any] = []
+        async for part in connection.recv_streaming():
+            parts.append(part)
+            if len(parts) > MOST_FRAMES:
+                raise SignalError(f"a message in more than {MOST_FRAMES} frames, expected fewer: send it in one")
+        return type(parts[0])().join(parts)
+
+    try:
+        return await asyncio.wait_for(whole(), patience_s)
+    except (TimeoutError, asyncio.TimeoutError):
+        raise SignalError(f"nothing was heard for {patience_s:.0f} s: send sound, or end the session") from None
+
+
+def _refuse(connection: ServerConnection, why: str) -> None:
+    """Close with a word; what still comes is read, so that the word is not lost, and forgotten."""
+    # RFC 6455, 5.5: 125 bytes with the code
+    connection.protocol.fail(1008, why.encode()[:120].decode(errors="ignore"))
+    connection.send_data()
+    connection.transport.resume_reading()
+
+
+def _let_go(connection: ServerConnection) -> None:
+    _LOGGER.warning("client %s reads too slowly; its connection is closed", connection.remote_address)
+    connection.transport.abort()
 
 
 def _microphones_of(pcm: bytes, count: int) -> Samples:

@@ -46,6 +46,8 @@ class TurnByTurn:
     def hear(self, samples: Samples, rate: int) -> None:
         """Take what was streamed, (n,) at rate."""
         self._rate = rate
+        if not samples.size:
+            return
         self._streamed.append(samples)
         self._count += samples.size
         most = round((LONGEST_S if self._open else BEFORE_S) * rate)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
@@ -22,6 +22,11 @@ JITTER_S = 0.06
 """For how long a message that is missing is waited for: three of 20 ms."""
 MOST_GAP_S = 10.0
 """Longest gap that is filled with silence; a counter that jumps further is another stream."""
+MOST_WAITING, MOST_WAITING_BYTES = 64, 16_000_000
+"""Messages of a stream that wait for one that is missing, and references before any microphone: a second of 20 ms. Bytes
+of all that waits: a gap of 10 s of eight microphones at 48 kHz, or a reference that is 83 s ahead of its microphone."""
+MOST_TEXT = 4096
+"""Characters of a message in JSON: a hundred times those of the longest that means something."""
 
 
 @dataclass(frozen=True)
@@ -79,29 +84,30 @@ class Form:
 def message_of(text: str | bytes) -> dict[str, Any]:
     """A message in JSON; raises SignalError for what is none."""
     try:
-        found = json.loads(text)
+        found = json.loads(text) if len(text) <= MOST_TEXT else None
     except (ValueError, RecursionError):
         found = None
     if isinstance(text, bytes) or not isinstance(found, dict):
-        raise SignalError(f"found {text[:40]!r}, expected a text message with an object in JSON")
+        raise SignalError(
+            f"found {text[:40]!r}, expected a text message with an object in JSON of {MOST_TEXT} characters at most"
+        )
     return found
 
 
 class _Order:
     """Messages of one stream in the order of their numbers; one that is missing is given up after a while.
 
-    give: called with the counter of its first sample, its sound, and how many messages were lost before it. newest: the
-    highest counter so far.
+    newest: the highest counter so far. bytes: of the sound that waits.
     """
 
-    def __init__(self, give: Callable[[int, bytes, int], None], jitter: int) -> None:
-        self._give, self._jitter = give, jitter
+    def __init__(self, jitter: int) -> None:
+        self._jitter = jitter
         self._next: int | None = None
         self._waiting: dict[int, tuple[int, bytes]] = {}
-        self.newest = 0
+        self.newest = self.bytes = 0
 
-    def push(self, number: int, at: int, sound: bytes) -> None:
-        """Take a message."""
+    def push(self, number: int, at: int, sound: bytes) -> Iterator[tuple[int, bytes, bool]]:
+        """Take a message; of all whose turn it is now the counter, the sound, and whether messages were lost before it."""
         if self._next is None:
             self._next = number
         ahead = (number - self._next + 32768) % 65536 - 32768
@@ -109,18 +115,24 @@ class _Order:
             return  # given up, or sent twice
         self.newest = max(self.newest, at)
         self._waiting[number] = (at, sound)
-        self._drain(0)
+        self.bytes += len(sound)
+        yield from self._drain(False)
         if self._waiting and self.newest - min(start for start, _ in self._waiting.values()) > self._jitter:
-            first = min(self._waiting, key=lambda each: (each - (self._next or 0)) % 65536)
-            lost, self._next = (first - self._next) % 65536, first
-            self._drain(lost)
+            self._next = min(self._waiting, key=lambda each: (each - (self._next or 0)) % 65536)
+            yield from self._drain(True)
+        if len(self._waiting) > MOST_WAITING:
+            raise SignalError(
+                f"{len(self._waiting)} messages wait for number {self._next} of their stream, expected {MOST_WAITING} at"
+                " most: count each stream's messages by one, and its samples"
+            )
 
-    def _drain(self, lost: int) -> None:
+    def _drain(self, lost: bool) -> Iterator[tuple[int, bytes, bool]]:
         while self._next in self._waiting:
             at, sound = self._waiting.pop(self._next)
             self._next = (self._next + 1) % 65536
-            self._give(at, sound, lost)
-            lost = 0
+            self.bytes -= len(sound)
+            yield at, sound, lost
+            lost = False
 
 
 Decode: TypeAlias = Callable[[bytes], Samples]
@@ -138,7 +150,7 @@ class TwoStreams:
     def __init__(self, decode_mic: Decode, decode_ref: Decode, rate: int, late: int) -> None:
         self._decode_mic, self._decode_ref, self._rate, self._wait = decode_mic, decode_ref, rate, late
         jitter = round(JITTER_S * rate)
-        self._mic_order, self._ref_order = _Order(self._take_mic, jitter), _Order(self._take_ref, jitter)
+        self._mic_order, self._ref_order = _Order(jitter), _Order(jitter)
         self._at: int | None = None
         self._mic, self._ref = decode_mic(b""), np.zeros(0, np.float32)
         self._early: list[tuple[int, Samples]] = []
@@ -146,14 +158,21 @@ class TwoStreams:
         self.lost = self.late = self.lateness = 0
 
     def push(self, message: bytes) -> None:
-        """Take a message with its header; raises SignalError for one that is none."""
+        """Take a message with its header; raises SignalError for one that is none, and where too much waits then."""
         if len(message) < HEADER.size:
             raise SignalError(f"found a message of {len(message)} bytes, expected a header of {HEADER.size} and sound")
         label, number, at = HEADER.unpack_from(message)
         orders = self._mic_order, self._ref_order
         if label >= len(orders):
             raise SignalError(f"found label {label}, expected 0 (microphone) or 1 (reference)")
-        orders[label].push(number, at, message[HEADER.size :])
+        for ready in orders[label].push(number, at, message[HEADER.size :]):
+            self._take_ref(*ready) if label else self._take_mic(*ready)
+        sound = self._mic.nbytes + self._ref.nbytes + sum(part.nbytes for _, part in self._early)
+        if (waiting := sound + self._mic_order.bytes + self._ref_order.bytes) > MOST_WAITING_BYTES:
+            raise SignalError(
+                f"{waiting} bytes wait for other messages, expected {MOST_WAITING_BYTES} at most: number each stream's"
+                " messages by one, and send a reference no sooner than its microphone"
+            )
 
     def take(self, last: bool = False) -> tuple[Samples, Samples]:
         """What is complete of both, (n,) or (n, microphones), and (n,); last: all."""
@@ -166,7 +185,7 @@ class TwoStreams:
         self._at += count
         return mic, np.concatenate((ref, np.zeros(count - ref.size, np.float32)))
 
-    def _take_mic(self, at: int, sound: bytes, lost: int) -> None:
+    def _take_mic(self, at: int, sound: bytes, lost: bool) -> None:
         samples = self._decode_mic(sound)
         if self._at is None:
             self._at = at
@@ -180,13 +199,13 @@ class TwoStreams:
             self._mic = np.concatenate((self._mic, np.zeros((gap, *self._mic.shape[1:]), np.float32)))
         self._mic = np.concatenate((self._mic, samples[max(-gap, 0) :]))
 
-    def _take_ref(self, at: int, sound: bytes, lost: int) -> None:
+    def _take_ref(self, at: int, sound: bytes, lost: bool) -> None:
         samples = self._decode_ref(sound)
         self.lost += max(at - self._ref_end, 0) if lost else 0
         self._ref_end = max(self._ref_end, at + samples.size)
         if self._at is None:
             self._early.append((at, samples))
-            del self._early[:-64]
+            del self._early[:-MOST_WAITING]
         else:
             self._place(at, samples)
 

@@ -13,14 +13,17 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import json
 import logging
 import shlex
 import signal
 import sys
 import time
-from collections.abc import Callable, Coroutine, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from functools import partial
 from typing import Any, cast
+from urllib.parse import urlsplit
 
 import numpy as np
 from wyoming.asr import Transcribe, Transcript
@@ -36,11 +39,12 @@ from wyoming.vad import VoiceStarted, VoiceStopped
 
 from edgefilter import __version__
 from edgefilter.audio.reader import RATES
-from edgefilter.errors import EdgefilterError, SignalError
+from edgefilter.errors import EdgefilterError, SignalError, UsageError, printable
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.filter.turns import BEFORE_S
 from edgefilter.integrations.channels import named, numbers
+from edgefilter.integrations.doors import complain_briefly, is_own
 from edgefilter.integrations.duplex import MOST_QUEUED_S, Duplex, as_pcm16, from_pcm16
 from edgefilter.integrations.turns import TurnByTurn
 from edgefilter.types import SAMPLE_RATE, Event
@@ -49,6 +53,9 @@ MOST_BYTES = round(MOST_QUEUED_S * SAMPLE_RATE) * np.int16().itemsize
 """Size of a message, and of all that a client has said and waits to be played: the queue's ten minutes, 19 MB."""
 RETRY_S = 1.0
 """Between two attempts to reach the microphone."""
+MOST_DATA, OVERHEAD, MOST_CLIENTS = 1 << 16, 512, 8
+"""Bytes of what a message says of its sound, as much as its first line may have; bytes that a message takes beside its sound;
+and clients of a service at a time, each of which may send so much."""
 AHEAD_S = 0.5
 """Speech that the loudspeaker gets before its turn: the size of aplay's buffer. The rest is still here when it is dropped."""
 UNDER_WAY_S = BargeInSettings.min_silence_s + BEFORE_S
@@ -102,9 +109,11 @@ class EgoService:
         self._microphone, self._stop_for_speech = microphone, stop_for_speech
         self.listeners: set[_Listener] = set()
         self.speakers: set[_Speaker] = set()
+        self.clients: defaultdict[type[_Client], set[_Client]] = defaultdict(set)
 
     async def run(self, mic_uri: str = MIC_URI, snd_uri: str = SND_URI, asr_uri: str = ASR_URI) -> None:
         """Serve all until cancelled."""
+        complain_briefly()
         uris = [mic_uri, snd_uri, *([asr_uri] if self.recogniser else ())]
         servers = [AsyncServer.from_uri(uri) for uri in uris]
         handlers: tuple[Callable[..., AsyncEventHandler], ...] = (_Listener, _Speaker, _Recogniser)
@@ -155,7 +164,7 @@ class EgoService:
                             await self._hear(_chunk_of(message))
                 why = "ended"
             except Exception as error:  # another service's messages must not end this one
-                why = f"cannot be read ({type(error).__name__}: {error})"
+                why = printable(f"cannot be read ({type(error).__name__}: {error})")
             _LOGGER.warning("microphone %s %s: again in %.0f s", self._microphone, why, RETRY_S)
             await asyncio.sleep(RETRY_S)
 
@@ -192,8 +201,17 @@ class _BoundedReader:
     """A stream's reader that refuses messages of more than MOST_BYTES before it reads them."""
 
     def __init__(self, reader: asyncio.StreamReader) -> None:
-        self._reader, self.readline, self.feed_eof = reader, reader.readline, reader.feed_eof
-        self.at_eof = reader.at_eof
+        self._reader, self.feed_eof, self.at_eof = reader, reader.feed_eof, reader.at_eof
+
+    async def readline(self) -> bytes:
+        line = await self._reader.readline()
+        with contextlib.suppress(ValueError, AttributeError):  # who asked reads it again, and says so
+            size = json.loads(line).get("data_length")
+            if (
+                isinstance(size, int | float) and size > MOST_DATA
+            ):  # of JSON, which takes time and twenty times the memory
+                raise SignalError(f"found a message with {size} bytes of data, expected at most {MOST_DATA}")
+        return line
 
     async def readexactly(self, count: int) -> bytes:
         if count > MOST_BYTES:
@@ -209,7 +227,11 @@ class _Client(AsyncEventHandler):
         self._service = service
 
     async def run(self) -> None:
+        clients = self._service.clients[type(self)]
         try:
+            if len(clients) >= MOST_CLIENTS:
+                raise SignalError(f"{MOST_CLIENTS} clients are connected already, expected fewer")
+            clients.add(self)
             await super().run()
             if not self.reader.at_eof():
                 raise SignalError("found what is no message, expected one in JSON")
@@ -217,7 +239,13 @@ class _Client(AsyncEventHandler):
             pass  # it has gone
         except Exception as error:
             peer = self.writer.get_extra_info("peername")
-            _LOGGER.warning("client %s: %s: %s; its connection is closed", peer, type(error).__name__, error)
+            said = printable(f"{type(error).__name__}: {error}")
+            _LOGGER.warning("client %s: %s; its connection is closed", peer, said)
+        finally:
+            if self not in clients:
+                await self.disconnect()
+                self.writer.close()
+            clients.discard(self)
 
 
 class _Listener(_Client):
@@ -267,22 +295,26 @@ class _Speaker(_Client):
         self._waiting_bytes = 0
         for message in waiting:
             if not isinstance(message, AudioChunk):
-                self._said.put_nowait(message)
+                self._put(message)
+
+    def _put(self, message: AudioChunk | AudioStop | None) -> None:
+        self._waiting_bytes += _size_of(message)
+        self._said.put_nowait(message)
 
     async def handle_event(self, event: Message) -> bool:
+        while self._waiting_bytes > MOST_BYTES:  # meanwhile the connection is read no further
+            await asyncio.sleep(AHEAD_S)
         if AudioStart.is_type(event.type):
             self._ignored = False
         elif AudioStop.is_type(event.type):
             self._speaking = False
-            self._said.put_nowait(AudioStop())
+            self._put(AudioStop())
         elif AudioChunk.is_type(event.type):
             chunk = _chunk_of(event)
-            while self._waiting_bytes > MOST_BYTES:  # meanwhile the connection is read no further
-                await asyncio.sleep(AHEAD_S)
             if not self._ignored:
                 self._speaking = True
-                self._waiting_bytes += len(chunk.audio)
-                self._said.put_nowait(chunk)
+                for piece in _pieces(chunk):
+                    self._put(piece)
         elif Describe.is_type(event.type):
             form = self._service.player.form
             await self.write_event(Info(snd=[SndProgram(name="edgefilter", snd_format=form, **ABOUT)]).event())
@@ -291,8 +323,8 @@ class _Speaker(_Client):
     async def _speak(self) -> None:
         try:
             while (message := await self._said.get()) is not None:
+                self._waiting_bytes -= _size_of(message)
                 if isinstance(message, AudioChunk):
-                    self._waiting_bytes -= len(message.audio)
                     await self._service.say(message)
                 else:
                     self._ignored = False
@@ -308,7 +340,7 @@ class _Speaker(_Client):
             self._task.cancel()
             await self._service.interrupt()
         else:
-            self._said.put_nowait(None)
+            self._put(None)
 
 
 class _Recogniser(_Client):
@@ -411,6 +443,17 @@ class Player:
             await client.disconnect()
 
 
+def _pieces(chunk: AudioChunk) -> Iterator[AudioChunk]:
+    """A chunk in parts of AHEAD_S: one of minutes would hold up the microphone while it is converted."""
+    size = round(AHEAD_S * chunk.rate) * chunk.width * chunk.channels
+    for at in range(0, len(chunk.audio), size):
+        yield AudioChunk(chunk.rate, chunk.width, chunk.channels, chunk.audio[at : at + size])
+
+
+def _size_of(message: AudioChunk | AudioStop | None) -> int:
+    return OVERHEAD + (len(message.audio) if isinstance(message, AudioChunk) else 0)
+
+
 def _chunk_of(message: Message) -> AudioChunk:
     """The sound in a message, at 16 bits; raises SignalError where the message does not say what it is or is cut."""
     rate, width, channels = (cast(int, message.data.get(key)) for key in ("rate", "width", "channels"))
@@ -444,21 +487,31 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--mic-uri", default=MIC_URI, help="where satellites find the microphone")
     parser.add_argument("--snd-uri", default=SND_URI, help="where satellites find the loudspeaker")
     parser.add_argument("--asr-uri", default=ASR_URI, help="where Home Assistant finds the recogniser")
+    told = "let other machines in: whoever reaches the ports hears the microphone and speaks, without a password"
+    parser.add_argument("--open", action="store_true", help=told)
     parser.add_argument("--stop-for-speech", action="store_true", help="fall silent when the human begins to speak")
     args = parser.parse_args(words)
+    uris = args.mic_uri, args.snd_uri, args.asr_uri
     try:
+        for option, uri in zip(("--mic-uri", "--snd-uri", "--asr-uri"), uris):
+            host = urlsplit(uri).hostname
+            if host is not None and not is_own(host) and not args.open:
+                raise UsageError(
+                    f"{option} {uri} lets other machines listen, and Wyoming knows no password: leave it out, or say --open"
+                    " where every machine that reaches it may hear the microphone and speak"
+                )
         ego = EgoFilter(args.profile, args.engine, barge_in=BargeInSettings(judge="network"))
         mic_format = AudioFormat(args.mic_command_rate, 2, args.mic_command_channels)
         snd_format = AudioFormat(args.snd_command_rate, 2, args.snd_command_channels)
         more = args.stop_for_speech, args.mic_channels, args.recogniser, args.reference_channel
         service = EgoService(args.microphone, args.loudspeaker, ego, mic_format, snd_format, *more)
-        asyncio.run(_until_sigterm(service.run(args.mic_uri, args.snd_uri, args.asr_uri)))
+        asyncio.run(_until_sigterm(service.run(*uris)))
     except KeyboardInterrupt:
         return 128 + signal.SIGINT
     except asyncio.CancelledError:
         return 128 + signal.SIGTERM
     except (EdgefilterError, OSError, ValueError) as error:
-        print(f"edgefilter: {error}", file=sys.stderr)
+        print(f"edgefilter: {printable(error)}", file=sys.stderr)
         return 1
     return 0
 

@@ -15,7 +15,7 @@ from edgefilter.echo.effect import complete
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.effects.catalogue import names as known_effects
 from edgefilter.echo.model import EchoModel
-from edgefilter.errors import ProfileError
+from edgefilter.errors import ProfileError, printable
 from edgefilter.profile.approximation import LinearApproximation
 from edgefilter.profile.array import ArrayCalibration
 from edgefilter.profile.file import REMEDY, Effects, check_array, read_fields, refuse, write_fields
@@ -186,9 +186,15 @@ class Profile:
             warnings = header.pop("warnings")
             if not isinstance(warnings, list):
                 refuse("warnings", f"a JSON {type(warnings).__name__}", "a list of texts")
-            fields: dict[str, Any] = {**arrays, **header}  # what type each has is checked on construction
+            told = tuple(printable(text) if isinstance(text, str) else text for text in warnings)
+            texts = {name: printable(value) if isinstance(value, str) else value for name, value in header.items()}
+            fields: dict[str, Any] = {
+                **arrays,
+                **texts,
+                "warnings": told,
+            }  # what type each has is checked on construction
             echo = EchoModel(fields.pop("impulse_response"), effects)
-            profile = cls(echo=echo, warnings=tuple(warnings), approximation=approximation, array=array, **fields)
+            profile = cls(echo=echo, approximation=approximation, array=array, **fields)
             _check_effects(echo)
             return profile
         except ProfileError as error:

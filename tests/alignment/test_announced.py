@@ -5,6 +5,7 @@ import pytest
 
 from edgefilter.alignment.aligner import Aligner
 from edgefilter.alignment.utterances import AHEAD, PATIENCE, Announcements
+from edgefilter.errors import SignalError
 from edgefilter.filter.ego_filter import EgoFilter
 from tests.alignment.scene import HEAD, RATE, fan, hear, room, run, speech_like, utterances
 
@@ -102,3 +103,14 @@ def test_playing_delivers_every_sample_once_and_then_the_next_is_expected():
     following = queue.expected(at).utterance
     assert not np.array_equal(following, first)
     assert np.abs(following).max() == np.abs(second).max()
+
+
+def test_more_announcements_than_may_wait_are_refused_and_those_before_still_wait():
+    """Each was kept, without end; in seconds, and in utterances of which each is short."""
+    for utterance, most in ((np.full(50 * 16_000, 0.1, np.float32), 6), (np.full(100, 0.1, np.float32), 64)):
+        ego = EgoFilter(engine="linear")
+        for _ in range(most):
+            ego.announce(utterance)
+        with pytest.raises(SignalError, match="more than 64 utterances or 300 s would"):
+            ego.announce(utterance)
+        assert ego.stats()["alignment"]["announced"] == most

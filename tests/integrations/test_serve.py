@@ -1,10 +1,16 @@
 """`edgefilter serve` with a real WebSocket client: what comes out, and clients that are slow, wrong, late or gone."""
 
 import asyncio
+import gc
 import json
+import resource
 import signal
+import socket
 import subprocess
 import sys
+import time
+import tracemalloc
+import weakref
 from contextlib import asynccontextmanager
 from pathlib import Path
 
@@ -22,7 +28,7 @@ from edgefilter.dsp.metrics import si_sdr
 from edgefilter.integrations import serve as module
 from edgefilter.integrations.opus import Decoder, Encoder
 from edgefilter.integrations.serve import Service
-from edgefilter.integrations.wire import HEADER, Form, TwoStreams
+from edgefilter.integrations.wire import HEADER, MOST_WAITING_BYTES, Form, TwoStreams
 
 ROOT = Path(__file__).parents[2]
 DEMO = Path(edgefilter.__file__).parent / "demo_data"
@@ -49,7 +55,12 @@ def as_float(data):
 @asynccontextmanager
 async def serving(engine="crnn", profile=DEMO / "profile.npz", streams=4, token=None):
     """The address of a service, which is ended afterwards."""
-    service = Service(lambda learns: EgoFilter(profile, engine), streams, 0, token)
+    async with served(Service(lambda learns: EgoFilter(profile, engine), streams, 0, token)) as address:
+        yield address
+
+
+@asynccontextmanager
+async def served(service):
     found = asyncio.get_running_loop().create_future()
     task = asyncio.create_task(service.run("127.0.0.1", 0, found.set_result))
     try:
@@ -495,6 +506,234 @@ def test_a_client_that_says_nothing_is_let_go(monkeypatch):
     assert "nothing was heard" in run(talk())
 
 
+def skipping(step, size):
+    """400 messages of the microphone whose counter stands still; a step of 2 leaves out every second number."""
+    return [HEADER.pack(MICROPHONE, (step * k) % 65536, 0) + bytes(size) for k in range(400)]
+
+
+def references(size):
+    """100 messages of a reference, each begins where the one before ends."""
+    return [HEADER.pack(REFERENCE, k, k * size // 2) + bytes(size) for k in range(100)]
+
+
+ANNOUNCED = [json.dumps({"kind": "announce"}), pcm(np.full(500_000, 0.1))]
+HOARDS = {
+    "numbers that skip": ({"streams": "two"}, skipping(2, 20), "64 at most: count each stream's messages by one"),
+    "large numbers that skip": ({"streams": "two"}, skipping(2, 3_900_000), "bytes wait for other messages"),
+    "references before any microphone": ({"streams": "two"}, references(3_900_000), "bytes wait for other messages"),
+    "a reference that runs ahead": ({"streams": "two"}, [HEADER.pack(0, 0, 0), *references(400_000)], "bytes wait"),
+    "announcements": ({}, ANNOUNCED * 300, "more than 64 utterances or 300 s would"),
+    "announcements of a word": (
+        {},
+        [ANNOUNCED[0], pcm(np.full(100, 0.1))] * 300,
+        "more than 64 utterances or 300 s would",
+    ),
+}
+"""What a client sends that wants to be kept: its first message, the others, and what it is told."""
+
+
+@pytest.mark.parametrize(("hello", "messages", "words"), HOARDS.values(), ids=HOARDS)
+def test_a_client_whose_messages_would_fill_the_memory_is_told_and_what_it_sent_is_free_at_once(hello, messages, words):
+    """Seen before: 106 to 1607 MB. What is freed without the collector of cycles is freed when the client leaves."""
+    kept = []
+
+    class Kept(EgoFilter):
+        def __init__(self, *args):
+            super().__init__(*args)
+            kept.append(weakref.ref(self))
+
+    async def talk():
+        service = Service(lambda learns: Kept(None, "linear"), 1, 0, None)
+        async with served(service) as address:
+            gc.disable()
+            try:
+                tracemalloc.start()
+                _, told = await converse(address, hello, messages)
+                return told, tracemalloc.get_traced_memory()[1], kept[0]()
+            finally:
+                tracemalloc.stop()
+                gc.enable()
+
+    told, most, left = run(talk())
+    assert told[-1]["kind"] == "error" and words in told[-1]["detail"]
+    assert most < 6 * MOST_WAITING_BYTES  # with this client's side of the connection
+    assert left is None
+
+
+class Counting(EgoFilter):
+    """Counts the samples that it was given."""
+
+    taken = 0
+
+    def process(self, mic, ref):
+        self.taken += len(mic)
+        return super().process(mic, ref)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("clients", [1, 3])
+def test_beside_clients_that_send_4_MB_at_once_a_stream_in_real_time_is_filtered_first(clients):
+    """Between a message and its answer, of 62 s that others have sent some parts of 20 ms are filtered."""
+    filters = []
+
+    def make(learns):
+        filters.append(Counting(None, "linear"))
+        return filters[-1]
+
+    async def flood(address):
+        await converse(address, {}, [bytes(4_000_000)])
+
+    async def talk():
+        between = []
+        async with served(Service(make, 4, 0, None)) as address, connect(address) as good:
+            await good.send("{}")
+            await good.recv()
+            floods = [asyncio.create_task(flood(address)) for _ in range(clients)]
+            began = asyncio.get_running_loop().time()
+            for number in range(100):
+                await asyncio.sleep(max(0.0, began + number * 0.016 - asyncio.get_running_loop().time()))
+                before = sum(each.taken for each in filters[1:])
+                await good.send(pcm(np.zeros((256, 2))))
+                if number > 1:
+                    await good.recv()
+                    between.append(sum(each.taken for each in filters[1:]) - before)
+            assert len(filters) == 1 + clients and not any(each.done() for each in floods)
+            for each in floods:
+                each.cancel()
+        return np.array(between) / (module.PART_S * RATE), [each.taken for each in filters[1:]]
+
+    between, taken = run(talk())
+    assert np.median(between) <= 1 and np.percentile(between, 90) <= 4
+    assert min(taken) > RATE  # the others go on meanwhile
+
+
+@pytest.mark.slow
+def test_a_client_that_is_behind_catches_up_before_others_go_on():
+    """A network that stood still for two seconds hands over all at once: that is due, and no backlog."""
+    filters = []
+
+    def make(learns):
+        filters.append(Counting(None, "linear"))
+        return filters[-1]
+
+    async def talk():
+        async with served(Service(make, 4, 0, None)) as address, connect(address) as good:
+            await good.send("{}")
+            await good.recv()
+            floods = [asyncio.create_task(converse(address, {}, [bytes(4_000_000)])) for _ in range(3)]
+            await asyncio.sleep(2.0)
+            before = sum(each.taken for each in filters[1:])
+            for _ in range(100):
+                await good.send(pcm(np.zeros((320, 2))))
+            got = 0
+            while got < 98 * 320 - 512:
+                got += len(await good.recv()) // 2
+            for each in floods:
+                each.cancel()
+            return got, sum(each.taken for each in filters[1:]) - before
+
+    own, others = run(talk())
+    assert others < 1.5 * own  # in turn with them it would be three times its own
+
+
+def frame(opcode, data=b"", fin=True):
+    """A frame as a client sends it, its mask of zeros."""
+    size = bytes([0x80 | len(data)]) if len(data) < 126 else b"\xfe" + len(data).to_bytes(2, "big")
+    return bytes([fin << 7 | opcode]) + size + bytes(4) + data
+
+
+MAD = {
+    "pings": (frame(9) * 200_000, "pings without a message"),
+    "frames without content": (frame(2, fin=False) + frame(0, fin=False) * 200_000, "in more than 1000 frames"),
+    "deep JSON": (frame(1, b"[" * 60_000), "expected a text message with an object in JSON of 4096 characters"),
+    "a name that controls the log": (
+        frame(1, json.dumps({"kind": "\x1b[2J\nedgefilter: hm\u202e"}).encode()), "\\x1b[2J\\nedgefilter: hm\\u202e",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("sent", "words"), MAD.values(), ids=MAD)
+def test_a_mad_client_is_told_in_one_line_and_others_go_on(sent, words, caplog):
+    async def talk():
+        async with serving("linear") as address, connect(address) as good, connect(address, max_queue=None) as mad:
+            for client in (good, mad):
+                await client.send("{}")
+                await client.recv()
+            mad.transport.write(sent)
+            await good.send(pcm(np.zeros((1024, 2))))
+            answer = await good.recv()
+            with pytest.raises(ConnectionClosed):
+                while True:
+                    await mad.recv()
+            return answer, mad.close_code, mad.close_reason
+
+    answer, code, reason = run(talk())
+    told = [record.getMessage() for record in caplog.records]
+    assert len(answer) > 0 and code == 1008 and any(words in line for line in (reason, *told))
+    assert all(line.isprintable() for line in (reason, *told)) and not any(record.exc_info for record in caplog.records)
+
+
+@pytest.mark.parametrize("hello", [{"\x1b[2J\nroot": 1}, {"codec": "\x1b]0;a\x07\n"}], ids=["name", "value"])
+def test_names_and_values_of_the_first_message_reach_the_log_as_text(hello, caplog):
+    _, told = run(heard(hello, [], engine="linear"))
+    lines = [told[-1]["detail"], *(record.getMessage() for record in caplog.records)]
+    assert len(lines) == 2 and all("\\x1b" in line and line.isprintable() for line in lines)
+
+
+def asking(port, *headers):
+    """A request for a connection, as bytes."""
+    key = "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Version: 13"
+    lines = ["GET / HTTP/1.1", f"Host: 127.0.0.1:{port}", "Upgrade: websocket", "Connection: Upgrade", *key, *headers]
+    return "\r\n".join([*lines, "", ""]).encode()
+
+
+def test_two_authorization_headers_are_refused_with_400_and_one_line(caplog):
+    async def talk():
+        async with serving("linear", token="0123456789abcdef") as address:
+            port = int(address.rpartition(":")[2])
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            writer.write(asking(port, *["Authorization: Bearer 0123456789abcdef"] * 2))
+            answer = await reader.read()
+            writer.close()
+            return answer
+
+    assert run(talk()).startswith(b"HTTP/1.1 400 ")
+    (record,) = caplog.records
+    assert "found 2 Authorization headers, expected one" in record.getMessage() and not record.exc_info
+
+
+def test_connections_that_say_nothing_give_way_and_a_client_is_served_among_them(caplog):
+    async def talk():
+        async with serving("linear") as address:
+            port = int(address.rpartition(":")[2])
+            idle = [await asyncio.open_connection("127.0.0.1", port) for _ in range(100)]
+            _, told = await converse(address, {}, stereo_messages(np.zeros(3200), np.zeros(3200)))
+            still = sum(not reader.at_eof() for reader, _ in idle)
+            for _, writer in idle:
+                writer.close()
+            return kinds(told)[-1], still
+
+    said, still = run(talk())
+    assert said == "ended" and 0 < still <= module.GUESTS
+    assert not any(record.exc_info or "\n" in record.getMessage() for record in caplog.records)
+
+
+def test_a_client_that_falls_silent_for_good_is_told_and_leaves_its_place(monkeypatch):
+    monkeypatch.setattr(module, "IDLE_S", 0.3)
+
+    async def talk():
+        async with serving("linear", streams=1) as address, connect(address) as server:
+            await server.send("{}")
+            await server.recv()
+            told = json.loads(await server.recv())
+            with pytest.raises(ConnectionClosed):
+                await server.recv()
+            _, after = await converse(address, {}, stereo_messages(np.zeros(3200), np.zeros(3200)))
+            return told["detail"], server.close_code, kinds(after)[-1]
+
+    assert run(talk()) == ("nothing was heard for 0 s: send sound, or end the session", 1008, "ended")
+
+
 @pytest.fixture
 def service(tmp_path):
     """The command as it is typed, and its address."""
@@ -569,3 +808,20 @@ def test_a_port_that_is_taken_is_one_line(service, capsys):
     assert main(["serve", "--port", address.rpartition(":")[2], "--engine", "linear"]) == 1
     told = capsys.readouterr().err.splitlines()
     assert len(told) == 1 and "cannot be served" in told[0]
+
+
+@pytest.mark.slow
+def test_without_descriptors_for_more_clients_the_service_says_so_in_one_line_and_goes_on(service):
+    process, address = service
+    there = len(list(Path(f"/proc/{process.pid}/fd").iterdir()))
+    resource.prlimit(process.pid, resource.RLIMIT_NOFILE, (there + 4, there + 4))
+    where = "127.0.0.1", int(address.rpartition(":")[2])
+    idle = [socket.create_connection(where) for _ in range(60)]
+    time.sleep(3)
+    for each in idle:
+        each.close()
+    _, told = run(converse(address, {}, stereo_messages(np.zeros(3200), np.zeros(3200))))
+    process.send_signal(signal.SIGTERM)
+    lines = process.communicate(timeout=20)[1].splitlines()
+    assert kinds(told)[-1] == "ended" and sum("accept" in line for line in lines) == 1
+    assert not any("Traceback" in line for line in lines)

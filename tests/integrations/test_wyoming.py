@@ -24,6 +24,7 @@ from wyoming.server import AsyncEventHandler, AsyncServer
 from wyoming.snd import Played
 
 from edgefilter import EgoFilter
+from edgefilter.integrations import wyoming as module
 from edgefilter.integrations.duplex import as_pcm16, from_pcm16
 from edgefilter.integrations.wyoming import EgoService, Player, main
 
@@ -490,3 +491,85 @@ def test_whoever_has_the_microphone_recognised_gets_the_words_of_the_finished_tu
     said = from_pcm16(chunk.audio)
     np.testing.assert_array_equal(said, from_pcm16(as_pcm16(turns[0].samples))[-said.size :])
     assert said.size > RATE
+
+
+def test_messages_without_sound_are_read_no_further_where_many_wait(endless_noise, player, monkeypatch):
+    monkeypatch.setattr(module, "MOST_BYTES", 80 * module.OVERHEAD)
+
+    async def talk():
+        async with running(endless_noise, player) as (service, connect, ports):
+            speaker = await connect("loudspeaker")
+            await speaker.write_event(noise())
+            for _ in range(5000):
+                await speaker.write_event(AudioStop().event())
+            (waiting,), most = service.speakers, 0
+            for _ in range(100):
+                await asyncio.sleep(0.01)
+                most = max(most, waiting._said.qsize())
+            assert 10 < most <= 81
+            await speaker.disconnect()
+
+    within_a_minute(talk)
+
+
+def test_data_of_a_message_that_take_long_to_read_are_refused_before_it(endless_noise, player, caplog):
+    async def talk():
+        async with running(endless_noise, player) as (_, connect, ports):
+            await (await connect("loudspeaker")).disconnect()
+            reader, writer = await asyncio.open_connection("127.0.0.1", ports["loudspeaker"])
+            writer.write(
+                json.dumps({"type": "audio-start", "data_length": 1_000_000}).encode() + b"\n" + b"[" * 500_000
+            )
+            with contextlib.suppress(ConnectionError):
+                assert await asyncio.wait_for(reader.read(), 5) == b""
+
+    within_a_minute(talk)
+    (line,) = logged(caplog)
+    assert "1000000 bytes of data, expected at most 65536" in line
+
+
+@pytest.mark.parametrize("end", ["microphone", "loudspeaker"])
+def test_more_clients_than_may_connect_are_let_go_in_one_line_and_others_go_on(end, endless_noise, player, caplog):
+    async def talk():
+        async with running(endless_noise, player) as (_, connect, ports):
+            there = [await connect(end) for _ in range(module.MOST_CLIENTS)]
+            for each in there:  # all of them are in
+                await each.write_event(Describe().event())
+                while (await each.read_event()).type != "info":
+                    pass
+            more = await connect(end)
+            while await more.read_event() is not None:
+                pass
+            await there[0].disconnect()
+            await asyncio.sleep(0.2)
+            again = await connect(end)
+            await again.write_event(Describe().event())
+            while (await again.read_event()).type != "info":
+                pass
+
+    within_a_minute(talk)
+    (line,) = logged(caplog)
+    assert "8 clients are connected already" in line
+
+
+def test_what_a_client_calls_its_rate_reaches_the_log_as_text(endless_noise, player, caplog):
+    async def talk():
+        async with running(endless_noise, player) as (_, connect, ports):
+            one = await connect("loudspeaker")
+            await one.write_event(Message("audio-chunk", {"rate": "\x1b[2J\nroot", "width": 2, "channels": 1}, b"ab"))
+            assert await one.read_event() is None
+
+    within_a_minute(talk)
+    (line,) = logged(caplog)
+    assert "\\x1b[2J" in line and line.isprintable()
+
+
+@pytest.mark.parametrize("option", ["--mic-uri", "--snd-uri", "--asr-uri"])
+def test_an_address_that_others_reach_is_refused_unless_they_are_let_in(option, capsys):
+    command = ["--microphone", "true", "--loudspeaker", "true", "--engine", "linear", option]
+    assert main([*command, "tcp://0.0.0.0:10600"]) == 1
+    told = capsys.readouterr().err
+    assert f"{option} tcp://0.0.0.0:10600 lets other machines listen" in told and told.count("\n") == 1
+    # let in, the next thing that is wrong is said
+    assert main([*command, "tcp://0.0.0.0:10600", "--open", "--mic-channels", "5"]) == 1
+    assert "channel 5 is named" in capsys.readouterr().err
