@@ -19,7 +19,8 @@ FLOOR = 2.0**-46
 SUSTAINED = 3
 """Hops that a level must last to be the voice's: 48 ms, a short vowel. A click falls into two at most."""
 VARIES = 10**1.5
-"""A voice's loudest hop is so much louder than its softest, or than the silence before, 15 dB; those of a noise are alike."""
+"""A voice's loudest hop is so much louder than its softest that is not digitally silent, 15 dB; those of a noise are alike, and
+begin as suddenly. Half of 150 synthetic voices vary so within 64 ms, 9 in 10 within 80 ms, with their first sounds cut off 440 ms."""
 NEVER = -sys.maxsize
 """A position long before the first sample."""
 LEAD = SAMPLE_RATE
@@ -72,7 +73,7 @@ class OnsetDetector:
     """Cuts the reference into utterances, hop by hop.
 
     current: the last one that began; before the first, one that ended long ago. peak, least: mean square of the loudest and of the
-    softest hop of the last seconds.
+    softest hop of the last seconds, the latter without digital silence.
     """
 
     def __init__(self, hop: int) -> None:
@@ -94,7 +95,11 @@ class OnsetDetector:
         self.now += self._hop
         power = float(ref.dot(ref)) / self._hop
         self.peak = max(self._sustained.step(power), self.peak * self._decay)
-        self.least = min(power, self.least / self._decay)
+        if power > FLOOR:
+            sounding = int(
+                np.count_nonzero(ref)
+            )  # where a device begins or leaves a hole in mid hop, its noise is as even
+            self.least = min(power * self._hop / sounding, self.least / self._decay)
         self.active = power > max(FLOOR, SILENT * self.peak)
         if not self.active:
             return None

@@ -86,7 +86,8 @@ def find_model(given: str | Path | None, variable: str, name: str, remedy: str) 
 def open_session(path: Path, content: bytes | None = None) -> onnxruntime.InferenceSession:
     """A session on one core: frames are too small to share, and a second thread that spins costs a whole core.
 
-    content: of the file, where it was read before. Denormal numbers count as zero in the thread that makes the session.
+    content: of the file, where it was read before. How the calling thread computes with denormal numbers stays as it is: to
+    have them count as zero, which onnxruntime can do for the first session alone and then for good, makes no hop shorter.
     Raises ModelError for what is no ONNX model, asks for operators of other libraries, or has weights in other files.
     """
     options = onnxruntime.SessionOptions()
@@ -94,7 +95,6 @@ def open_session(path: Path, content: bytes | None = None) -> onnxruntime.Infere
     options.log_severity_level = 4
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
-    options.add_session_config_entry("session.set_denormal_as_zero", "1")
     content = _read(path) if content is None else content
     if OTHER_FILES in content:
         raise ModelError(f"model {path} takes its weights from other files, expected them inside: export it again")
