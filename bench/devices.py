@@ -36,8 +36,9 @@ AHEAD_DB = 1.0
 """The best peer counts as ahead on a device by more than this."""
 NOTES = """SI-SDR and word errors (at most 100 % an utterance) over the human who was laid on; the robot alone: by how much
 its recordings are lowered as a whole; false starts: every `speech_started` in them. Means are of devices, each with the same
-weight, and so are their 95 % intervals; differences are paired by device. 'Kept apart' devices were not looked at while the
-filter was made; the others stand apart. Peers get microphone and reference as the engines do."""
+weight, and so are their 95 % intervals; differences are paired by device. 'Kept apart' are a device that was not looked at while
+the filter was made, and the second half of one whose first half was tuned on; the others stand apart. Peers get microphone
+and reference as the engines do."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

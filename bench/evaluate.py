@@ -37,8 +37,8 @@ PARTS = 3
 """A quantity is cut into so many slices of about as many clips each."""
 FEW = 8
 """With fewer clips nothing is said of a conclusion."""
-NORMED = {systems.BATCH_NORM: "paper-crnn-narrow", "crnn:batch-norm": "crnn"}
-"""Networks with batch normalisation, and the row that each is compared with."""
+NORMED = {systems.BATCH_NORM: "paper-crnn-narrow"}
+"""A network with batch normalisation, and the row that it is compared with."""
 WORST = 10
 """Clips that the page names, and lets hear with --html."""
 NOTES = """Mean [95 % interval], drawn over speakers and rooms, not over utterances. WER: word errors over the span in which
@@ -293,11 +293,16 @@ def _measures(rows: Sequence[dict]) -> list[tuple[str, int, str]]:
     return [*words, ("si_sdr", -1, "dB")]
 
 
+def _network(rows: Sequence[dict]) -> str:
+    """The source paper's network, or the narrower one of its shape; no other stands for it, and nothing is said without."""
+    return next((name for name in ("paper-crnn", "paper-crnn-narrow") if of(rows, name)), "")
+
+
 def _volume_and_pitch(rows: Sequence[dict]) -> str:
     key, _, said, worse = metric(rows)
     signs, told = [], []
     for fact, name in (("level_db", "level"), ("pitch_hz", "pitch")):
-        for system in ("paper-ss", "crnn"):
+        for system in ("paper-ss", _network(rows)):
             if found := correlation(of(rows, system), fact, key):
                 told.append(f"{name} and {system} {found[0]:+.2f} [{found[1]:+.2f}, {found[2]:+.2f}]")
                 signs.append(_sign(-worse * found[1], -worse * found[2]))
@@ -308,7 +313,7 @@ def _volume_and_pitch(rows: Sequence[dict]) -> str:
 def _reverberation(rows: Sequence[dict]) -> str:
     """By how much more the office costs paper-ss than the network."""
     title = "Spectral subtraction suffers from reverberation, the network less"
-    network = next((name for name in ("paper-crnn", "crnn") if of(rows, name)), "")
+    network = _network(rows)
     signs, told = [], []
     for key, worse, unit in _measures(rows):
         draws = {}

@@ -260,15 +260,17 @@ def plain(value: Any) -> Any:
 def cell(value: Any, digits: int | None = None) -> str:
     """A cell of a table as text.
 
-    >>> cell({"mean": 31.2, "low": 25.04, "high": 37.1}, 0), cell(None), cell(2.345, 1)
-    ('31 [25, 37]', '', '2.3')
+    An interval without a width, of a single recording or of figures that are all alike, says nothing and is left out.
+
+    >>> cell({"mean": 31.2, "low": 25.04, "high": 37.1}, 0), cell({"mean": 9.2, "low": 9.2, "high": 9.2}, 1), cell(None)
+    ('31 [25, 37]', '9.2', '')
     """
     if value is None:
         return ""
     if isinstance(value, Mapping):
         mean = cell(value["mean"], digits)
         bounds = [cell(value.get(key), digits) for key in ("low", "high")]
-        return f"{mean} [{bounds[0]}, {bounds[1]}]" if all(bounds) else mean
+        return f"{mean} [{bounds[0]}, {bounds[1]}]" if all(bounds) and value["low"] != value["high"] else mean
     if isinstance(value, float) and digits is None:
         return f"{value:g}"
     return f"{value:.{digits}f}" if isinstance(value, (int, float)) and digits is not None else str(value)

@@ -1,4 +1,4 @@
-"""VoiceFilter (Wang et al. 2019), the source paper's baseline.
+"""VoiceFilter (Wang et al. 2019), enrolled with the human; the source paper enrols its baseline with the robot.
 
 The network is a small one of this project's own training, bench/models/voicefilter.onnx: the weights of the authors and
 those of Park, which the paper used, are in no package; see models/MODELS.md. It asks for a whole clip and for another

@@ -154,6 +154,7 @@ def filter_blocks(
     stopped: Callable[[], bool] = lambda: False,
     tell: Callable[[Event], None] = lambda event: None,
     troubles: Callable[[int, bool], list[Event]] = lambda sample, last: [],
+    due: bool = True,
 ) -> RunReport:
     """Run ego over every block of source until it ends or stopped() says so; always flush into sink what was received.
 
@@ -161,6 +162,7 @@ def filter_blocks(
     was received is filtered and flushed as far as the sink still takes it, and the error stands in report.failure.
 
     show: called after each block. tell: called with each event of the filter, and of source and sink by troubles(sample, last).
+    due: whether somebody waits for the sound; for a recording no hop is too late, and no event says that it is.
     """
     report, progress = RunReport(), Progress()
     began = time.perf_counter()
@@ -172,7 +174,8 @@ def filter_blocks(
             recorder.write_output(out)
 
     def tell_events(last: bool) -> None:
-        for event in [*ego.events(), *troubles(report.samples_in, last)]:
+        happened = [event for event in ego.events() if due or event.kind != "overloaded"]
+        for event in [*happened, *troubles(report.samples_in, last)]:
             tell(event)
             report.events.append(replace(event, turn=None))
 

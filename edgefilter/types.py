@@ -237,9 +237,12 @@ def as_samples(x: object, name: str) -> Samples:
     """
     array = np.asarray(x)
     if array.dtype.kind != "f":
-        raise SignalError(
-            f"{name} has dtype {array.dtype}, expected float samples in +-1: divide integer PCM by its full scale"
-        )
+        how = "divide integer PCM by its full scale"
+        if array.dtype.itemsize == 1 or array.dtype.kind == "S":  # bytes, as the raw streams of sounddevice have them
+            how = (
+                "of bytes make samples first, numpy.frombuffer(buffer, numpy.float32), or numpy.int16 and then / 32768"
+            )
+        raise SignalError(f"{name} has dtype {array.dtype}, expected float samples in +-1: {how}")
     if array.ndim != 1:
         raise SignalError(f"{name} has shape {array.shape}, expected one channel of shape (n,)")
     array = np.ascontiguousarray(array, np.float32)
@@ -256,18 +259,16 @@ def as_samples(x: object, name: str) -> Samples:
     return array
 
 
-def as_microphones(x: object, name: str) -> Samples:
+def as_microphones(x: object, name: str, most: int = MOST_MICROPHONES) -> Samples:
     """Return x (n,) or (n, channels) as (n,) float32 where it has one channel, else as (channels, n), contiguous.
 
-    Raises SignalError for more than MOST_MICROPHONES channels, and as as_samples does.
+    Raises SignalError for more than most channels, and as as_samples does.
     """
     array = np.asarray(x)
     if array.ndim != 2:
         return as_samples(array, name)
-    if not 1 <= array.shape[1] <= MOST_MICROPHONES:
-        raise SignalError(
-            f"{name} has shape {array.shape}, expected (n,) or (n, channels) with 1 to {MOST_MICROPHONES} channels"
-        )
+    if not 1 <= array.shape[1] <= most:
+        raise SignalError(f"{name} has shape {array.shape}, expected (n,) or (n, channels) with 1 to {most} channels")
     if array.shape[1] == 1:
         return as_samples(array[:, 0], name)
     return np.stack([as_samples(channel, f"{name}, channel {at},") for at, channel in enumerate(array.T)])

@@ -1,4 +1,4 @@
-"""Train the source paper's baseline, VoiceFilter (Wang et al. 2019), on simulated conversations, and write its ONNX file.
+"""Train VoiceFilter (Wang et al. 2019), told the human's voice, on simulated conversations, and write its ONNX file.
 
     python -m export.voicefilter --data DIR --speech HUMANS --validation DIR --validation-speech HUMANS --output RUN
         [--steps 2000] [--minutes M] [--seed 1]

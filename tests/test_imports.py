@@ -55,6 +55,7 @@ LAYERS = (
     {"learning"},
     {"commands"},
     {"cli"},
+    {"__main__"},
 )
 """Folders and files of the package from the ground up (docs/architecture.md). A subject may import its own and what
 stands lower, never a neighbour on its own floor. edgefilter/__init__.py is the door: it leads to all of them, and

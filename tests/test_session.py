@@ -29,6 +29,19 @@ def test_every_command_starts_where_there_is_no_resource_module(tmp_path):
     assert json.loads(done.stdout)["peak_memory_mb"] is None
 
 
+@pytest.mark.parametrize("due", [True, False])
+def test_a_recording_which_has_no_deadline_is_not_told_to_be_too_slow_for_it(due):
+    told: list[Event] = []
+    silence = np.zeros(4096, np.float32)
+
+    class Nowhere:
+        def write(self, out: np.ndarray) -> None: ...
+
+    ego = EgoFilter(engine="linear", budget_ms=1e-6)  # which no hop keeps
+    report = filter_blocks([Block(silence, silence, 0)] * 3, ego, Nowhere(), tell=told.append, due=due)
+    assert [event.kind for event in told] == [event.kind for event in report.events] == ["overloaded"] * due
+
+
 def test_the_report_of_a_run_keeps_what_happened_without_its_sound():
     """A run may last for weeks, and each turn of the human holds seconds of sound: who is told may keep it."""
     told: list[Event] = []

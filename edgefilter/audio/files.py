@@ -273,12 +273,23 @@ def _take_alone(file: io.FileIO) -> None:
             raise
 
 
+def form_of(output: Path) -> str:
+    """WAV or FLAC, by the suffix; raises UsageError for another one, and for a folder."""
+    if output.is_dir():
+        raise UsageError(
+            f"output {output} is a folder, expected a file: name one in it, such as {output / 'human.wav'}"
+        )
+    if (form := output.suffix[1:].upper()) not in ("WAV", "FLAC"):
+        raise UsageError(f"output {output} ends in '{output.suffix}', expected .wav or .flac: rename it")
+    return form
+
+
 class FileSink(Sink):
     """A 16 kHz file, WAV or FLAC by suffix, 16-bit PCM (or 32-bit float for WAV), mono unless channels are more.
 
     Valid up to the last sample however the context is left, and where the program is killed: a WAV up to the last
     write, a FLAC up to the last of its frames of a quarter of a second.
-    Raises UsageError for another suffix, AudioFileError where the file cannot be written, another program is writing
+    Raises UsageError for another suffix and a folder, AudioFileError where the file cannot be written, another program is writing
     it, or the disk is full; then what fitted remains, as a valid file.
 
     >>> import tempfile, numpy as np
@@ -292,9 +303,7 @@ class FileSink(Sink):
     def __init__(self, path: str | Path, float32: bool = False, channels: int = 1) -> None:
         self.path = Path(path)
         self.notes = []
-        form = self.path.suffix[1:].upper()
-        if form not in ("WAV", "FLAC"):
-            raise UsageError(f"output {self.path} ends in '{self.path.suffix}', expected .wav or .flac: rename it")
+        form = form_of(self.path)
         if self.path.is_fifo():
             raise AudioFileError(
                 f"output {self.path} is a pipe, expected a file: only 'run' writes raw samples to a pipe"

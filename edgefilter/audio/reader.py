@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -18,6 +19,15 @@ from edgefilter.types import LOUDEST, SAMPLE_RATE, Array, Samples, which_channel
 
 RATES = range(1000, 768001)
 """Hz that converters have; a header that says another is damaged."""
+OTHER_FORMS = {
+    b"ftyp": "an MPEG-4 file (m4a, mp4)",
+    b"\x1aE\xdf\xa3": "a Matroska file (webm, mkv)",
+    b"\xff\xf1": "an AAC file",
+    b"\xff\xf9": "an AAC file",
+    b"#!AMR": "an AMR file",
+    b"0&\xb2u": "a Windows Media file (wma)",
+}
+"""What telephones and browsers record that libsndfile does not read, by its first bytes, in MPEG-4 the fifth to eighth."""
 _ENDLESS = 0x7FFFF000
 """Writers to a pipe put sizes from here up into a WAV's header because they cannot know better."""
 
@@ -96,6 +106,10 @@ class Reader:
         except soundfile.LibsndfileError as error:
             with open(self.path, "rb") as file:
                 start = file.read(12)
+            form = next((name for mark, name in OTHER_FORMS.items() if mark in (start[: len(mark)], start[4:8])), None)
+            if form:
+                made = f"ffmpeg -i {shlex.quote(str(self.path))} {shlex.quote(f'{self.path.stem}.wav')}"
+                raise self._error(f"is {form}, expected WAV, FLAC or Ogg: convert it, for instance by {made}") from None
             found = f"starts with {start!r}" if start.isascii() else f"starts with the bytes {start.hex(' ')}"
             raise self._error(
                 f"is not audio ({found}; {_reason(error)}), expected WAV, FLAC or Ogg: convert it"

@@ -49,7 +49,7 @@ def _filter(args: argparse.Namespace) -> None:
         ego = EgoFilter(DEMO / "profile.npz", args.engine)
         output = folder / "filtered.wav"
         with FileSource(DEMO / "mic.flac", DEMO / "reference.flac") as source, FileSink(output) as sink:
-            report = filter_blocks(source, ego, sink)
+            report = filter_blocks(source, ego, sink, due=False)
         if report.failure:
             raise report.failure
         step("again without the robot's calibration")
@@ -73,12 +73,15 @@ def _filter(args: argparse.Namespace) -> None:
             }
             plots.plot_before_after(sounds, folder / "before_after.png")
             files.append("before_after.png")
+    begun, ended = (at / SAMPLE_RATE for at in (speaking(human).start, speaking(human).stop))
     without = "" if cold is None else f", {cold:.1f} dB without it"
     lines = [
         f"a simulated robot talks, a human interrupts; filtered with engine {ego.engine_name}"
         f" ({report.process_s / (report.samples_in / SAMPLE_RATE):.3f} of real time, {describe_latency(ego)})",
         f"SI-SDR of the human: {figures['si_sdr_before_db']:.1f} dB before, {figures['si_sdr_after_db']:.1f} dB after"
         f" with the robot's calibration{without}",
+        f"listen to microphone.wav, in which the robot hides the human, who speaks from {begun:.0f} to {ended:.0f} s; then to"
+        " filtered.wav, from which the robot is gone; human.wav is the human alone",
         f"files: {', '.join(str(folder / file) for file in files)}",
     ]
     print_result(args, lines, figures)
@@ -163,6 +166,7 @@ def _mend(name: str, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     lines = [
         "  SI-SDR of the human who interrupts it: {si_sdr_microphone_db:.1f} dB at the microphone, {si_sdr_before_db:.1f}"
         " dB with the profile as it was, {si_sdr_after_db:.1f} dB with better.npz".format(**figures),
+        "  listen to human_before.wav, in which the robot is still heard beside the human, and to human_after.wav",
         f"what had been changed: {', '.join(case.truth['effects'])}",
         f"files in {folder}: {', '.join([*written, *drawn])}",
         "",

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from edgefilter.audio import pulse, virtual
 from edgefilter.audio.device import find, monitor_of, speaker
-from edgefilter.audio.files import open_sink, open_source
+from edgefilter.audio.files import form_of, open_sink, open_source
 from edgefilter.audio.live import LiveSink, LiveSource
 from edgefilter.audio.port import SpokenReference
 from edgefilter.audio.protocols import Sink, Source, Troubles
@@ -31,10 +31,15 @@ from edgefilter.profile.data import Profile
 from edgefilter.session import RunReport, Verdict, filter_blocks
 from edgefilter.types import ALL_CHANNELS, SAMPLE_RATE, Block
 
-FILE_ENDINGS = (".wav", ".flac", ".ogg", ".mp3", ".aiff", ".aif", ".w64", ".opus", ".txt", ".raw", ".pcm")
+FILE_ENDINGS = (
+    *(".wav", ".flac", ".ogg", ".mp3", ".aiff", ".aif", ".w64", ".opus", ".txt", ".raw", ".pcm"),
+    *(".m4a", ".mp4", ".aac", ".3gp", ".amr", ".webm", ".mkv", ".wma"),
+)
 
 
 def main(args: argparse.Namespace) -> int:
+    if not is_device(args.output) and args.output != "-" and not Path(args.output).is_fifo():
+        form_of(Path(args.output))
     speech = make_speech(args)
     file = args.learn if args.learn and Path(args.learn).exists() else args.profile
     profile = Profile.load(file) if file else None
@@ -62,6 +67,7 @@ def main(args: argparse.Namespace) -> int:
             stopped=lambda: bool(stopped) or sink.finished,
             tell=observers.hear,
             troubles=Troubles(source, sink),
+            due=source.total is None,
         )
         report.interrupted |= bool(stopped)
     for note in [*source.notes[told:], *sink.notes]:

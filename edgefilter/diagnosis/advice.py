@@ -58,7 +58,7 @@ def remaining(tried: Sequence[Candidate]) -> tuple[tuple[str, ...], ...]:
     Events are left out, since no other recording has them.
     """
     named = [row for row in tried if row.verdict == "named"]
-    rivals = [row for row in tried if row.verdict in ("explained by another", "failed its proof")]
+    rivals = [row for row in tried if row.verdict in ("explained by another", "explains too little")]
     gains = [row.gain_db or 0.0 for row in rivals]
     most = sum(max(row.beside_db or 0.0, row.gain_db or 0.0) for row in named) if named else max(gains, default=0.0)
     near = sorted((r for r in rivals if (r.gain_db or 0.0) >= RIVAL * most > 0.0), key=lambda r: -(r.gain_db or 0.0))

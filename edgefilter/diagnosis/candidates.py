@@ -68,7 +68,7 @@ def _fate(entry: Tried, found: Found, named: Collection[str]) -> tuple[Fate, str
     if entry.name in named:
         return "named", ""
     if any(step.name == entry.name for step in found.steps):
-        return "failed its proof", "all that was found together explains too little"
+        return "explains too little", "and so does all that was found together"
     if entry.failed:
         return "not fitted", entry.failed
     if entry.spared:
@@ -78,7 +78,7 @@ def _fate(entry: Tried, found: Found, named: Collection[str]) -> tuple[Fate, str
     if entry.short:
         return "below its bar", entry.short
     if not named:
-        return "failed its proof", "what it explains is too little to be what happened"
+        return "explains too little", "for it to be what happened"
     beside = entry.beside
     added = f"beside what is named it adds {beside.gain_db:.2f} dB" if beside else "what is named leaves it nothing"
     return "explained by another", added

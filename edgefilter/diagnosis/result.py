@@ -21,8 +21,10 @@ if TYPE_CHECKING:
     from edgefilter.diagnosis.proof import Proof
 
 Verdict: TypeAlias = Literal["missing", "explained", "unexplained"]
-Fate: TypeAlias = Literal["named", "explained by another", "below its bar", "failed its proof", "not fitted"]
-"""What became of an effect that was tried."""
+Fate: TypeAlias = Literal[
+    "named", "explained by another", "explains too little", "below its bar", "failed its proof", "not fitted"
+]
+"""What became of an effect that was tried; only where a proof in the running filter was asked for can it have failed one."""
 Source: TypeAlias = Literal["jacobian", "thirds", "at its bound", "none"]
 """Of a standard error: the prediction's derivatives, fits to a third of the recording each, or why there is none."""
 SCHEMA = 2

@@ -86,7 +86,8 @@ def find_model(given: str | Path | None, variable: str, name: str, remedy: str) 
 def open_session(path: Path, content: bytes | None = None) -> onnxruntime.InferenceSession:
     """A session on one core: frames are too small to share, and a second thread that spins costs a whole core.
 
-    content: of the file, where it was read before. Denormal numbers count as zero in the thread that makes the session.
+    content: of the file, where it was read before. How the calling thread computes with denormal numbers stays as it is: to
+    have them count as zero, which onnxruntime can do for the first session alone and then for good, makes no hop shorter.
     Raises ModelError for what is no ONNX model, and before anything opens it for functions, loops and branches, operators of
     other libraries and weights in other files.
     """
@@ -95,7 +96,6 @@ def open_session(path: Path, content: bytes | None = None) -> onnxruntime.Infere
     options.log_severity_level = 4
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
-    options.add_session_config_entry("session.set_denormal_as_zero", "1")
     content = _read(path) if content is None else content
     # its own format, which would be taken for this one, is not read beforehand
     options.add_session_config_entry("session.load_model_format", "ONNX")

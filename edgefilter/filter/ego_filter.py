@@ -35,8 +35,9 @@ class EgoFilter:
         One of `edgefilter.ENGINES`, or "auto" for the strongest that can be made here.
     budget_ms : float, optional
         Compute per hop to keep to. Where more is needed for long, cheaper engines take over (see Stepping), each time
-        with an event. Without a budget the engine stays, and missed deadlines are only counted; so it does where the
-        settings of barge-in have judge="network", since no engine is cheaper than the network.
+        with an event. Without a budget the engine stays, and missed deadlines are only counted; so it does, and
+        `engine_reason` says so, where the settings of barge-in have judge="network", since no engine is cheaper than the
+        network, and with an engine that waits for the end.
     reason : str
         Why an engine that was named was chosen, for `stats`.
     model : str or Path, optional
@@ -111,8 +112,14 @@ class EgoFilter:
         if network_judges:
             best = with_network_as_judge(best, self.profile)
         ladder = None
-        if not (network_judges or budget_ms is None or best.lookahead is None):
-            ladder = Ladder(climbable(best, self.profile))
+        if budget_ms is not None:
+            if network_judges or best.lookahead is None:
+                why = (
+                    "none is cheaper than the network that judges speech" if network_judges else "it waits for the end"
+                )
+                self.engine_reason += f"; a budget of {budget_ms:g} ms does not change the engine: {why}"
+            else:
+                ladder = Ladder(climbable(best, self.profile))
         stepping = Stepping(best.stft.hop, ladder, budget_ms)
         self._stream = Stream(ladder or best, self.profile, stepping, barge_in, learn, on_barge_in, keep_channels)
 

@@ -24,7 +24,7 @@ from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.filter.turns import WAITING_S, drop_sound
 from edgefilter.integrations.channels import named, taken
-from edgefilter.types import SAMPLE_RATE, SET_UP_WRONG, Event, Samples
+from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, SET_UP_WRONG, Event, Samples, as_microphones
 
 MOST_QUEUED_S = WAITING_S
 """Speech that may wait to be played, as much as turns may wait: longer than any answer. The rest is refused and counted."""
@@ -132,14 +132,18 @@ class Duplex:
         self._talking_since = self._left_at = clock()
 
     def play(self, samples: Samples, rate: int) -> None:
-        """Take speech that is handed to the loudspeaker, (n,) at rate, to be played after all that was before it."""
+        """Take speech that is handed to the loudspeaker, to be played after all that was before it.
+
+        samples: one channel of float, full scale +-1, (n,) or (n, 1), at rate. Raises SignalError as `EgoFilter.process` does.
+        """
+        speech = as_microphones(samples, "speech", most=1)
         with self._queue_lock:
             if not self._talking:
                 self._talking, self._talking_since = True, self._clock()
             if self._from_agent.rates[0] != rate:
                 self._finish()
                 self._from_agent = Resampler(rate, SAMPLE_RATE)
-            self._append(self._from_agent.push(samples))
+            self._append(self._from_agent.push(speech))
 
     def play_pcm16(self, pcm: bytes | memoryview, rate: int, channels: int = 1) -> None:
         """As `play`, for 16-bit samples, interleaved."""
@@ -171,13 +175,14 @@ class Duplex:
     def hear(self, samples: Samples, rate: int, at_s: float | None = None) -> Samples:
         """Take the microphone's next samples at rate and return finished samples of the human (m,), at the same rate.
 
-        samples: (n,), of an array (n, channels), as many channels in each call. at_s: when the first of them was recorded,
-        by the sender's clock, where that is known; sound that was lost on the way shows by it at once. One call may return none or more than
-        came in. All together are as many as came in, later by the filter's latency and, at another rate than 16 kHz, by
-        the resamplers' 3.5 ms each way.
+        samples: float, full scale +-1, (n,), of an array (n, channels), as many channels in each call. at_s: when the first of
+        them was recorded, by the sender's clock, where that is known; sound that was lost on the way shows by it at once. One
+        call may return none or more than came in. All together are as many as came in, later by the filter's latency and, at
+        another rate than 16 kHz, by the resamplers' 3.5 ms each way. Raises SignalError as `EgoFilter.process` does.
         """
         if self._wanted is not None:
-            samples = taken(samples.reshape(len(samples), -1), self._wanted)
+            samples = taken(np.reshape(samples, (len(samples), -1)), self._wanted)
+        samples = np.ascontiguousarray(as_microphones(samples, "mic", MOST_MICROPHONES + self._both).T)
         with self._hear_lock:
             channels = 1 if samples.ndim == 1 else samples.shape[1]
             if self._from_mic.rates[0] != rate or self._from_mic.channels != channels:

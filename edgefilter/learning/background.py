@@ -172,6 +172,7 @@ class _Worker:
             while data := self._from.read(1 << 16):
                 self._received += data
         except OSError:  # the process has ended
+            self.process.poll()  # which else would stay in the system's table as one that nobody has asked about
             self.unsent.clear()
         return self._whole()
 

@@ -118,6 +118,17 @@ def test_the_noise_of_a_loopback_is_no_robot_until_a_voice_rises_above_it():
     assert heard.any() and anywhere[:at][heard].all() and not anywhere[: RATE // HOP - 1].any()
 
 
+@pytest.mark.parametrize("gap", [slice(0, RATE), slice(0, 1), slice(RATE, RATE + 3 * HOP + 5)])
+def test_where_the_noise_of_a_loopback_was_digitally_silent_a_human_loses_no_more_than_a_quarter_second(gap):
+    """After one such hop anything was a voice for good, and two seconds were lost."""
+    rng = np.random.default_rng(7)
+    noise = (3e-4 * rng.standard_normal(5 * RATE)).astype(np.float32)
+    noise[gap.start : max(gap.stop, HOP)] = 0.0  # as a device that starts, or that has nothing to deliver once
+    human = utterances(rng, [5.0], [0.0])[0][: noise.size]
+    _, anywhere, found = told(human, noise, None)
+    assert any(aligned.state == "begun" for aligned in found) and not anywhere[(gap.stop + LONGEST) // HOP + 2 :].any()
+
+
 def test_soft_first_sounds_of_a_calibrated_voice_make_nobody_loud():
     rng = np.random.default_rng(5)
     ref = (1e-4 * rng.standard_normal(2 * RATE)).astype(np.float32)

@@ -102,6 +102,7 @@ def test_sound_that_a_driver_loses_without_a_word_is_counted(both):
     stats = source.stats()
     for name in ("microphone_lost", "reference_lost"):
         assert stats[name] == pytest.approx(0.5 * 16000, abs=2 * STEP)
+    assert stats["lost"] == pytest.approx(0.5 * 16000, abs=2 * STEP), "half a second is missing, not one a device"
 
 
 def test_after_a_suspend_the_run_goes_on_and_says_how_long_nothing_was_heard(both, tmp_path):
@@ -113,6 +114,7 @@ def test_after_a_suspend_the_run_goes_on_and_says_how_long_nothing_was_heard(bot
     stats = source.stats()
     assert stats["microphone_lost"] == pytest.approx(3600 * 16000, rel=1e-3) and stats["microphone_gone"] == 0
     assert any("microphone lost" in event.detail for event in told["lost"])
+    assert report.lost == stats["lost"] == pytest.approx(3600 * 16000, rel=1e-3)  # of both devices: said were two hours
 
 
 def test_a_filter_that_is_too_slow_loses_what_the_rings_cannot_hold_and_counts_it(both):

@@ -102,6 +102,9 @@ def broken(folder, kind):
         soundfile.write(path, np.zeros(0), 16000)
     elif kind == "text":
         path.write_text("dear diary, this is not audio\n" * 20)
+    elif kind in ("m4a", "webm"):  # as telephones and browsers record
+        start = {"m4a": b"\x00\x00\x00\x1cftypM4A \x00\x00\x02\x00isomiso2", "webm": b"\x1aE\xdf\xa3\x9fB\x86\x81\x01"}
+        path.write_bytes(start[kind] + bytes(1000))
     elif kind in ("nan", "inf"):
         x = noise(40000)
         x[34567] = float(kind)
@@ -124,6 +127,8 @@ def broken(folder, kind):
         ("nothing", r"empty \(0 bytes\)"),
         ("header", "0 samples"),
         ("text", "is not audio .*dear diary"),
+        ("m4a", r"is an MPEG-4 file \(m4a, mp4\), expected WAV, FLAC or Ogg: .* ffmpeg -i \S+ \S+\.wav$"),
+        ("webm", r"is a Matroska file .*ffmpeg -i \S+ \S+\.wav$"),
         ("nan", r"holds nan at sample 34567"),
         ("inf", r"holds inf at sample 34567"),
         ("scaled", r"holds -?1.01e\+06, expected samples of a full scale of 1: its scaling is wrong"),

@@ -11,6 +11,7 @@ import pytest
 
 from bench import __main__ as program
 from bench import results, stale, systems
+from bench.cache import Cache
 from bench.systems import Output
 
 
@@ -35,7 +36,26 @@ def test_a_result_is_stale_where_a_system_gives_another_sound(
     assert "devices.json, devices: half behave differently now" in capsys.readouterr().err
     old = tmp_path / "old.json"
     old.write_text(json.dumps({"schema": 2, "rows": []}))
-    assert stale.stale(old) == ["old.json: of an earlier form"]
+    assert stale.stale(old, Cache(None)) == ["old.json: of an earlier form"]
+    stale.digest_of.cache_clear()
+
+
+def test_what_is_learned_is_computed_once_for_the_same_code_and_anew_for_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each look took minutes of a processor."""
+    heard: list[str] = []
+    known = systems.catalogue()["unfiltered"]
+    row = replace(
+        known, name="half-learning", run=lambda clip: heard.append(clip.source.name) or Output(0.5 * clip.mic)
+    )
+    monkeypatch.setattr(systems, "catalogue", lambda *_: {row.name: row})
+    found = []
+    for code in ("one", "one", "two"):
+        monkeypatch.setattr(results, "code_digest", lambda files=None, code=code: code)
+        stale.digest_of.cache_clear()
+        found.append(stale.today(row.name, Cache(tmp_path, "digests")))
+    assert len(set(found)) == 1 and len(heard) == 2 * len(stale.demos())
     stale.digest_of.cache_clear()
 
 

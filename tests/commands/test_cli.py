@@ -6,6 +6,8 @@ import signal
 import subprocess
 import sys
 import time
+from importlib.metadata import entry_points
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -197,6 +199,35 @@ def test_output_over_an_input_is_refused(speech):
     before = (speech / "mic.wav").read_bytes()
     one_line(run(speech, output="mic.wav", program=edgefilter), 2, "overwritten")
     assert (speech / "mic.wav").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("output", "words"),
+    [("out.m4a", ["ends in '.m4a'", ".wav or .flac"]), ("there", ["is a folder", "there/human.wav"])],
+)
+def test_an_output_that_cannot_be_written_is_refused_before_anything_is_looked_at(speech, output, words, monkeypatch):
+    """The first was looked for among the sound devices, the second was said to end in ''."""
+    (speech / "there").mkdir()
+    monkeypatch.chdir(speech)
+    one_line(here("run", "--input", "missing.wav", "--engine", "bypass", "--output", output), 2, *words)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_while_it_is_still_being_loaded_it_says_so_in_one_line(number):
+    """It took a traceback of the import that was under way, and exit code -2."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "edgefilter", "devices"], stderr=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    maps, until = Path(f"/proc/{process.pid}/maps"), time.monotonic() + 30
+    while "numpy" not in maps.read_text():  # in the midst of the imports
+        assert time.monotonic() < until
+    process.send_signal(number)
+    assert process.communicate(timeout=60)[1] == b"edgefilter: interrupted\n" and process.returncode == 130
+
+
+def test_the_program_begins_where_it_can_be_interrupted():
+    (program,) = [each for each in entry_points(group="console_scripts") if each.name == "edgefilter"]
+    assert program.value == "edgefilter.__main__:main"
 
 
 def test_a_damaged_profile_is_one_line(speech):

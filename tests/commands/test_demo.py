@@ -64,6 +64,15 @@ def test_it_says_the_figures_and_that_they_are_simulated(demo):
 
 
 @pytest.mark.slow
+def test_it_says_what_to_listen_to(demo):
+    (line,) = [line for line in demo[1].splitlines() if line.startswith("listen")]
+    begun, ended = map(int, re.search(r"from (\d+) to (\d+) s", line).groups())
+    human, rate = soundfile.read(demo[0] / "human.wav")
+    assert abs(human[: rate * begun - rate]).max() < 1e-3 < abs(human[rate * begun : rate * ended]).max()
+    assert all(f"{name}.wav" in line for name in ("microphone", "filtered", "human"))
+
+
+@pytest.mark.slow
 def test_it_says_what_is_calibrated_and_what_not(demo):
     folder, text = demo
     cold = json.loads((folder / "demo.json").read_text())["si_sdr_after_uncalibrated_db"]

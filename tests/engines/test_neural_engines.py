@@ -146,11 +146,26 @@ def test_stats_name_the_model_and_what_it_says_of_itself():
     assert EgoFilter(engine="ss").stats()["model"] is None
 
 
-def test_one_thread_without_spinning_and_with_denormals_as_zero():
+def test_one_thread_without_spinning():
     options = onnx_session.open_session(EDGE).get_session_options()
     assert options.intra_op_num_threads == options.inter_op_num_threads == 1
     assert options.get_session_config_entry("session.intra_op.allow_spinning") == "0"
-    assert options.get_session_config_entry("session.set_denormal_as_zero") == "1"
+
+
+def test_denormal_numbers_survive_in_the_thread_of_the_caller_and_in_those_it_starts():
+    """In a process of its own, for only its first session changes that; the library's users compute beside the filter."""
+    code = (
+        "import threading, numpy as np\n"
+        "from edgefilter import EgoFilter\n"
+        "tell = lambda: print((np.full(9, 1e-40, np.float32) * np.float32(0.5)).all())\n"
+        f"ego = EgoFilter(engine='crnn', model={str(EDGE)!r})\n"
+        "tell()\n"
+        "ego.process(np.zeros(4096), np.zeros(4096))\n"
+        "tell()\n"
+        "threading.Thread(target=tell).start()"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert said.split() == ["True"] * 3
 
 
 @pytest.mark.parametrize(
@@ -325,6 +340,7 @@ def test_a_budget_does_not_replace_an_engine_that_waits_for_the_end():
     ego = EgoFilter(engine="paper-crnn", model=PAPER, budget_ms=0.001)
     assert ego.waits_for_end and ego.process(mic, ref).size == 0 and ego.flush().shape == mic.shape
     assert ego.stats()["latency_ms"] is None
+    assert "a budget of 0.001 ms does not change the engine: it waits for the end" in ego.engine_reason
 
 
 def test_the_loudest_frame_is_one_of_three_as_loud_and_is_forgotten_by_10_db_in_a_minute():

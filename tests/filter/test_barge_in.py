@@ -134,6 +134,15 @@ def test_the_network_can_judge_beside_an_engine_that_does_not_and_changes_nothin
     assert stats["engine"] == "ss" and stats["model"] == found["crnn"][2].stats()["model"]
 
 
+def test_a_budget_that_changes_no_engine_beside_the_network_as_judge_is_no_secret():
+    network = BargeInSettings(judge="network")
+    for engine in ("crnn", "ss"):
+        reason = EgoFilter(engine=engine, budget_ms=0.001, barge_in=network).stats()["engine_reason"]
+        assert "a budget of 0.001 ms does not change the engine: none is cheaper than the network" in reason
+    for free in (EgoFilter(engine="ss", barge_in=network), EgoFilter(engine="ss", budget_ms=0.001)):
+        assert "budget" not in free.engine_reason
+
+
 def test_engines_that_take_other_frames_cannot_judge_for_one_another():
     with pytest.raises(
         UsageError, match="engine crnn cannot judge speech for bypass: its front is full, expected none"

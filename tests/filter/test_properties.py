@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -9,7 +11,6 @@ from pathlib import Path
 import hypothesis.strategies as st
 import numpy as np
 import pytest
-import soundfile
 from hypothesis import given, settings
 
 import edgefilter
@@ -123,14 +124,30 @@ def test_a_block_that_is_refused_leaves_no_trace(name):
 
 @pytest.mark.slow
 def test_a_minute_of_digital_silence_does_not_end_the_run():
-    """Found here: a division by zero after 45 s of it, where there is no profile and denormal numbers count as zero."""
-    ego, nothing = FILTERS["crnn"](), np.zeros(65_536, np.float32)
-    for _ in range(60 * SAMPLE_RATE // nothing.size):
-        assert not ego.process(nothing, nothing).any()
-    spoken, _ = soundfile.read(DEMO / "human.flac", dtype="float32")
-    human = spoken[9 * SAMPLE_RATE : 14 * SAMPLE_RATE]  # no white noise, which is taken for a fan after a second
-    out = np.concatenate((ego.process(human, np.zeros_like(human)), ego.flush()))[-human.size :]
-    assert np.mean(out[SAMPLE_RATE:] ** 2) > 0.5 * np.mean(human[SAMPLE_RATE:] ** 2)
+    """Found here: a division by zero after 45 s of it, where there is no profile and denormal numbers count as zero.
+
+    The first session of a process can make them count so in the thread that opens it, as other programs do by other means.
+    """
+    code = f"""
+import onnxruntime
+options = onnxruntime.SessionOptions()
+options.add_session_config_entry("session.set_denormal_as_zero", "1")
+onnxruntime.InferenceSession({str(TINY)!r}, options, providers=["CPUExecutionProvider"])
+
+import numpy as np, soundfile
+from edgefilter import EgoFilter
+assert not (np.full(9, 1e-40, np.float32) * np.float32(0.5)).any()
+ego, nothing = EgoFilter(engine="crnn", model={str(TINY)!r}), np.zeros(65_536, np.float32)
+for _ in range({60 * SAMPLE_RATE} // nothing.size):
+    assert not ego.process(nothing, nothing).any()
+spoken, _ = soundfile.read({str(DEMO / "human.flac")!r}, dtype="float32")
+human = spoken[{9 * SAMPLE_RATE} : {14 * SAMPLE_RATE}]  # no white noise, which is taken for a fan after a second
+out = np.concatenate((ego.process(human, np.zeros_like(human)), ego.flush()))[-human.size :]
+assert np.mean(out[{SAMPLE_RATE}:] ** 2) > 0.5 * np.mean(human[{SAMPLE_RATE}:] ** 2)
+assert not (np.full(9, 1e-40, np.float32) * np.float32(0.5)).any()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_after_a_minute_of_a_muted_microphone_the_fan_is_found_again():

@@ -57,6 +57,31 @@ def witness():
     return Witness()
 
 
+@pytest.mark.parametrize("rate", [RATE, 48_000])
+def test_sound_of_another_kind_is_refused_as_the_filter_does_and_a_column_is_a_channel(witness, rate):
+    """16-bit samples were taken for samples 90 dB louder, a column of them ended the next hop in an error of numpy."""
+    duplex, frame = Duplex(witness), VOICE[:480]
+    wrong = {
+        "dtype int16, expected float": (32767 * frame).astype(np.int16),
+        r"dtype uint8, .*numpy.frombuffer\(buffer, numpy.float32\)": memoryview(bytes(960)),  # as RawInputStream has it
+        "dtype .S3.*frombuffer": b"abc",
+        "holds nan": np.full(480, np.nan, np.float32),
+    }
+    for words, samples in wrong.items():
+        for take, name in ((duplex.play, "speech"), (duplex.hear, "mic")):
+            with pytest.raises(SignalError, match=f"{name} (has )?{words}"):
+                take(samples, rate)
+    with pytest.raises(SignalError, match=r"speech has shape \(480, 2\), expected"):
+        duplex.play(np.stack((frame, frame), axis=1), rate)
+    assert duplex.queued_s == 0 and duplex.heard == 0
+    columns, row = Duplex(Witness()), duplex
+    for each, shape in ((columns, (-1, 1)), (row, (-1,))):
+        each.play(VOICE[:RATE].reshape(shape), rate)
+    heard = [each.hear(VOICE[:4800].reshape(shape), rate) for each, shape in ((columns, (-1, 1)), (row, (-1,)))]
+    assert heard[0].size > 1000 and np.array_equal(*heard)
+    assert row.ego.reference.any() and np.array_equal(columns.ego.reference, row.ego.reference)
+
+
 def listen(duplex, seconds, rate=RATE, frame=320):
     """Let seconds pass at the microphone; how much of them came out."""
     total = round(seconds * rate)

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -101,6 +102,18 @@ def test_a_filter_that_is_used_again_learns_again():
         end()
         ego.reset()
     ego.close()
+
+
+def test_a_learner_that_was_killed_is_no_zombie_beside_the_running_filter(short):
+    learner = BackgroundLearner()
+    ego = EgoFilter(engine="linear", learn=learner)
+    os.kill(learner.pid, signal.SIGKILL)
+    until, pid = time.monotonic() + 60, learner.pid
+    while Path(f"/proc/{pid}").exists():
+        assert time.monotonic() < until, Path(f"/proc/{pid}/status").read_text()
+        ego.process(short.mic[: 16 * HOP], short.reference[: 16 * HOP])
+    ego.close()
+    assert learner.stats()["process"] == "ended"
 
 
 @pytest.mark.parametrize("path", [[], [""]], ids=["as it is", "with the working directory"])

@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from PIL import Image
 
 from edgefilter.echo.model import EchoModel
@@ -44,6 +46,26 @@ def test_profile_picture_shows_the_profile(tmp_path):
     a, b, c = (pixels(tmp_path / f"{name}.png") for name in "abc")
     assert a.shape == (880, 1210) and a.std() > 10
     assert np.array_equal(a, b) and not np.array_equal(a, c)
+
+
+def test_nothing_that_is_written_is_cut_at_the_edge_of_the_picture(tmp_path, monkeypatch):
+    """A title was longer than its panel is wide, and its end was missing."""
+    drawn = []
+    save = Figure.savefig
+    monkeypatch.setattr(
+        Figure, "savefig", lambda figure, *given, **named: drawn.append(figure) or save(figure, *given, **named)
+    )
+    loud = replace(profile(warnings=("clipped: 9 samples " * 9,) * 3), distortion_db=np.full(4, -100.0))
+    plot_profile(loud, tmp_path / "a.png")
+    texts = [
+        text for axes in drawn[0].axes for text in (axes.title, axes._left_title, axes.xaxis.label, axes.yaxis.label)
+    ]
+    texts = [text for text in (*texts, drawn[0]._suptitle) if text.get_text()]
+    assert len(texts) > 12
+    renderer = FigureCanvasAgg(drawn[0]).get_renderer()
+    for text in texts:
+        box = text.get_window_extent(renderer)
+        assert 0 <= box.x0 and box.x1 <= 1210 and 0 <= box.y0 and box.y1 <= 880, text.get_text()
 
 
 @pytest.mark.slow
