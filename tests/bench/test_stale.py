@@ -46,7 +46,9 @@ def test_what_is_learned_is_computed_once_for_the_same_code_and_anew_for_another
     """Each look took minutes of a processor."""
     heard: list[str] = []
     known = systems.catalogue()["unfiltered"]
-    row = replace(known, name="half-learning", run=lambda clip: heard.append(clip.source.name) or Output(0.5 * clip.mic))
+    row = replace(
+        known, name="half-learning", run=lambda clip: heard.append(clip.source.name) or Output(0.5 * clip.mic)
+    )
     monkeypatch.setattr(systems, "catalogue", lambda *_: {row.name: row})
     found = []
     for code in ("one", "one", "two"):
