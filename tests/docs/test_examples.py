@@ -153,3 +153,14 @@ def test_the_simulated_room_holds_the_robot_and_then_the_human(tmp_path):
     assert db(heard[RATE : 2 * RATE]) > db(heard[7 * RATE : 8 * RATE]) + 15 > db(heard[: RATE // 10]) + 15
     said, _ = run("words.py", tmp_path / "heard.wav")
     assert said == b"(9.0 s)\n"
+
+
+@pytest.mark.parametrize(
+    "address", [["ws://127.0.0.1:9"], ["nonsense"], []], ids=["nobody serves", "no address", "none"]
+)
+def test_the_satellite_without_a_service_says_so_in_one_line(address):
+    words = [sys.executable, EXAMPLES / "satellite.py", *address]
+    done = subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1 and done.stderr.count("\n") == 1 and done.stderr.startswith("satellite.py: "), (
+        done.stderr
+    )
