@@ -279,7 +279,8 @@ class _Spectra:
 
     def __init__(self, mic: Samples, near: Samples, fan: Samples, period: int) -> None:
         window = hann(period)
-        x, y = (fft.rfft(frames(s, period, period // 2) * window, axis=1) for s in (near, mic))
+        # with half a frame of silence around it each sample counts the same, those at the ends too
+        x, y = (fft.rfft(frames(np.pad(s, period // 2), period, period // 2) * window, axis=1) for s in (near, mic))
         played, heard = power(x), power(y)
         self.hz = frequencies(period // 2 + 1)
         self._scale = 2 / period / np.sum(window**2)
@@ -357,11 +358,11 @@ def _bands(mic: Samples, spectra: _Spectra, outputs: dict[str, Samples]) -> list
 
 
 def _cause(removable_db: float, over_noise_db: float, follows: float, gated: float, clipped: float) -> Cause:
-    """A gate before all else, since it hides the noise; noise where it alone explains what is not linear."""
-    if removable_db >= ENOUGH_DB:
-        return "nothing"
+    """A gate before all else, since it takes the human too; noise where it alone explains what is not linear."""
     if gated >= GATED_SHARE:
         return "gate"
+    if removable_db >= ENOUGH_DB:
+        return "nothing"
     if removable_db > over_noise_db - MOSTLY_NOISE_DB:
         return "noise"
     if clipped >= CLIPPED_SHARE:

@@ -10,7 +10,7 @@ MOST_FIELDS = 1_000_000
 _ELSEWHERE = "takes its weights from other files, expected them inside"
 _LOOPS = "has graphs within its graph (Loop, If, Scan), expected one that runs straight on"
 _FUNCTIONS = "has functions of its own, expected standard operators alone"
-_FOREIGN = "asks for operators of '{}', expected standard ones (ai.onnx)"
+_FOREIGN = "asks for operators of '{}', expected those of ONNX and of ONNX Runtime"
 # by number each field that holds more of its kind, or that none may hold: what is wrong then
 _TENSOR = {13: _ELSEWHERE, 14: _ELSEWHERE}
 _SPARSE = {1: _TENSOR, 2: _TENSOR}
@@ -18,8 +18,8 @@ _ATTRIBUTE = {5: _TENSOR, 6: _LOOPS, 10: _TENSOR, 11: _LOOPS, 22: _SPARSE, 23: _
 _NODE = {5: _ATTRIBUTE, 7: _FOREIGN}
 _GRAPH = {1: _NODE, 5: _TENSOR, 15: _SPARSE}
 _MODEL = {7: _GRAPH, 20: _LOOPS, 25: _FUNCTIONS}
-_HARMLESS = {_ELSEWHERE: (0,), _FOREIGN: (b"", b"ai.onnx")}
-"""What such a field may hold all the same: that data are inside, and the domain of the standard operators."""
+_HARMLESS = {_ELSEWHERE: (0,), _FOREIGN: (b"", b"ai.onnx", b"com.microsoft")}
+"""What such a field may hold all the same: that data are inside; the standard operators, and those that ONNX Runtime itself has."""
 
 
 def refusal(content: bytes) -> str | None:

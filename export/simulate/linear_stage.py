@@ -11,7 +11,7 @@ from edgefilter.dsp.stft import Analyser, StftConfig, Synthesiser
 from edgefilter.engines.linear import Linear
 from edgefilter.filter.canceller import COLD, WARM, Adaptation, Canceller, CancellerOutput
 from edgefilter.filter.echo_path import EchoPath
-from edgefilter.filter.front_end import FrontEnd
+from edgefilter.filter.front_end import Centred, FrontEnd
 from edgefilter.learning.path_learner import PathLearner
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Samples
@@ -153,7 +153,7 @@ def listen(
     beside a low cut.
     """
     hop, hops = stft.hop, mic.size // stft.hop
-    own, voices = Analyser(stft, 2), [Synthesiser(stft) for _ in range(5)]
+    own, centred, voices = Analyser(stft, 2), Centred(hop), [Synthesiser(stft) for _ in range(5)]
     cut = np.float32(1.0) if front.cut is None else front.cut
     sound = np.zeros((5, (hops + 1) * hop), np.float32)
     noise, residual = np.zeros((2, hops, stft.bins), np.uint8)
@@ -161,7 +161,7 @@ def listen(
     for t in range(hops + 1):
         at = slice(t * hop, (t + 1) * hop)
         frame, _ = front.step(inputs[0, at], inputs[1, at])
-        spectra = frame.mic, frame.reference, frame.error, *(cut * own.push(*inputs[2:, at]))
+        spectra = frame.mic, frame.reference, frame.error, *(cut * own.push(*centred.step(inputs[2:, at])))
         for row, voice, spectrum in zip(sound, voices, spectra):
             row[at] = voice.push(spectrum)
         if t < hops:

@@ -138,7 +138,7 @@ def test_a_swapped_human_is_as_loud_as_the_one_who_was_there(data, monkeypatch):
     def drawn(share):
         monkeypatch.setattr("export.crops.SWAPPED", share)
         monkeypatch.setattr("export.crops.COLOURED", 0.0)
-        return Batches(Items(data), StftConfig(), Shape(16, 1.0), seed=3).draw(0)
+        return Batches(Items(data), StftConfig(), Shape(16, 3.0), seed=3).draw(0)
 
     swapped, kept = drawn(1.0), drawn(0.0)
     power = [batch["clean"].square().sum((1, 2, 3)) for batch in (swapped, kept)]
