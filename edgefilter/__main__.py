@@ -8,7 +8,7 @@ import sys
 
 
 def main() -> int:
-    """The command line with an answer to SIGINT and SIGTERM from the first moment on; its own take their place for a command."""
+    """Run the command line; SIGINT and SIGTERM end it cleanly from the start, later each command sets handlers of its own."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _leave)
     from edgefilter.cli import main
@@ -17,7 +17,7 @@ def main() -> int:
 
 
 def _leave(*_: object) -> None:
-    """End at once: an exception in the midst of an import may be swallowed, or told by a traceback."""
+    """Exit at once: KeyboardInterrupt raised inside an import may be swallowed, or end in a traceback."""
     os.write(2, b"edgefilter: interrupted\n")
     os._exit(130)
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 
 def printable(text: object, most: int | None = None) -> str:
-    r"""Make one line of what others wrote (a file, a client, a library): blanks for white space, what controls a terminal escaped.
+    r"""Make text from outside (a file, a client, a library) safe to print: one line, without codes that control a terminal.
 
-    most: characters.
+    White space becomes single blanks, other control characters are escaped. most: characters that are kept.
 
     >>> printable("\x1b[2J\n a name", 12)
     '\\x1b[2J a na'

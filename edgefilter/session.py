@@ -28,9 +28,8 @@ AUDIBLE_DB = -50.0
 class Progress:
     """What a display may show after each block: samples so far, and levels of the block in dB of full scale.
 
-    residual_db: level of the output against the microphone's while the robot talks and no human is noticed, over about
-    the last second; None before. load: computing time per duration of the sound, over the same time. robot_s: seconds in
-    which the robot talks.
+    residual_db: level of the output relative to the microphone's while only the robot talks, over about the last second;
+    None before. load: real-time factor over the same time. robot_s: seconds of robot speech so far.
     """
 
     samples: int = 0
@@ -96,7 +95,7 @@ class Verdict:
         wrong = [event.detail for event in kept if event.kind in SET_UP_WRONG]
         if not wrong and alignment and lag is None and not found and progress.robot_s >= UNFOUND_S:
             wrong = [
-                f"the reference carries {progress.robot_s:.0f} s of sound that is found nowhere in the microphone: is it of"
+                f"the reference carries {progress.robot_s:.0f} s of sound, and nothing of it is found in the microphone: is it from"
                 " another recording, or was the loudspeaker muted, or were headphones used?"
             ]
         lag_ms = None if lag is None else abs(1000 * lag / SAMPLE_RATE)

@@ -144,9 +144,9 @@ class Announcements:
         self._since: int | None = None
 
     def add(self, utterance: Samples) -> bool:
-        """Queue an utterance (n,); the silence before its first sound does not count, and one without any sound is left out.
+        """Queue an utterance (n,), without the silence that it begins with; one that is all silence is skipped.
 
-        False, and nothing is queued, where more would wait than may.
+        Returns False, and queues nothing, if more than MOST_ANNOUNCED utterances or MOST_ANNOUNCED_S seconds would wait.
         """
         loud = np.flatnonzero(np.abs(utterance) > max(0.01 * float(np.abs(utterance).max(initial=0.0)), FLOOR**0.5))
         sound = utterance[max(loud[0] - 256, 0) : loud[-1] + 1] if loud.size else utterance[:0]

@@ -280,7 +280,7 @@ def verdict_lines(verdict: Verdict) -> list[str]:
     told = []
     if verdict.removed_db is not None:
         after = "" if verdict.lag_ms is None else f", heard {verdict.lag_ms:.0f} ms after the reference"
-        told.append(f"the robot alone was lowered by {verdict.removed_db:.1f} dB{after}")
+        told.append(f"while it talked alone, the robot was lowered by {verdict.removed_db:.1f} dB{after}")
     if verdict.noticed is not None:
         times = "never" if not verdict.noticed else "once" if verdict.noticed == 1 else f"{verdict.noticed} times"
         told.append(f"a human was noticed {times}")

@@ -36,8 +36,8 @@ PAUSE_S = 2.0
 WINDOW_S, STRETCH = 2.0, 1024
 """Windows in which the lag is looked for, that many samples around what the whole says."""
 LONG, LEAST_FRAMES = 4 * PERIOD, 4
-"""Samples of the longer frames, 2 s, as long as the response of any room that people talk in; least length of a recording in
-frames of a length that is used."""
+"""Samples of the longer of two analysis frames: 2 s, which no room that people talk in outlasts. A recording holds at least
+LEAST_FRAMES frames of a length, or that length is not used."""
 MOSTLY_NOISE_DB = 2.0
 """Of the noise under the microphone, dB, over what is not linear, up to which noise is most of that, 63 %: of ten real devices
 one that distorts loudly (yw9vi) has 2.7."""
@@ -175,7 +175,7 @@ def measure(
             near = interpolate(near, np.arange(near.size) * (1.0 + 1e-6 * ppm))
     progress("coherence")
     fan, pauses_s = fan_in_silences(mic, silences(near))
-    # a room that outlasts the frames seems to change: of several lengths that counts by which the most is linear
+    # echo later than a frame lasts looks like distortion: take the frame length that explains most of the microphone
     seen = [_Spectra(mic, near, fan, period) for period in (PERIOD, LONG) if mic.size >= LEAST_FRAMES * period]
     spectra = max(seen, key=lambda each: each.over(0.0, SAMPLE_RATE / 2)[0])
     outputs, told = {}, {}

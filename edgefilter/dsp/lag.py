@@ -16,8 +16,8 @@ LIKELY_HZ = 50.0
 LOWEST_HZ = 100.0
 """A voice and its room begin here; what lies below is rumble."""
 ONE_SIGNAL = 0.999
-"""Squared correlation coefficient of two signals, sample by sample, from which on they are one: sound needs some samples to
-a microphone, and a room and its noise leave less than -30 dB nowhere."""
+"""Squared correlation coefficient of two signals at lag 0 from which on they are copies of one signal. A microphone's signal
+comes some samples later than its reference, with noise and reverberation above -30 dB, and never correlates so highly."""
 SAME = 0.98
 """Correlation of a copy with what it is a copy of, both cut from the same second at a lag of some ms."""
 

@@ -46,7 +46,7 @@ def refusal(content: bytes) -> str | None:
 
 
 def _fields(message: memoryview) -> Iterator[tuple[int, int | memoryview]]:
-    """Number and value of each field: a number, or the bytes of what is fixed in size or says its length."""
+    """Yield (field number, value) of each protobuf field: an int for a varint, otherwise the field's bytes."""
     at = 0
     while at < len(message):
         tag, at = _varint(message, at)
@@ -61,7 +61,9 @@ def _fields(message: memoryview) -> Iterator[tuple[int, int | memoryview]]:
             size = {1: 8, 5: 4}.get(kind, -1)
         # libraries cut longer tags to 32 bits: they would read another field than is seen here
         if not 0 < number < 1 << 29 or not 0 <= size <= len(message) - at:
-            raise ValueError(f"field {number} of kind {kind} and {size} bytes where {len(message) - at} are left")
+            raise ValueError(
+                f"field {number} (wire type {kind}) says {size} bytes, and the message ends after {len(message) - at}"
+            )
         yield number, message[at : at + size]
         at += size
 

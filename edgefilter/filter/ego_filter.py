@@ -34,10 +34,10 @@ class EgoFilter:
     engine : str
         One of `edgefilter.ENGINES`, or "auto" for the strongest that can be made here.
     budget_ms : float, optional
-        Compute per hop to keep to. Where more is needed for long, cheaper engines take over (see Stepping), each time
-        with an event. Without a budget the engine stays, and missed deadlines are only counted; so it does, and
-        `engine_reason` says so, where the settings of barge-in have judge="network", since no engine is cheaper than the
-        network, and with an engine that waits for the end.
+        Milliseconds of computing that a hop may take. If hops take longer for some time, a cheaper engine takes over
+        (see Stepping), and an event says so. Without a budget the engine is never changed and missed deadlines are only
+        counted. The budget has no effect with judge="network" in `barge_in`, since only the network judges speech there,
+        nor with an engine that waits for the end of the recording; `engine_reason` then says so.
     reason : str
         Why an engine that was named was chosen, for `stats`.
     model : str or Path, optional
@@ -48,12 +48,12 @@ class EgoFilter:
         Learns loudspeaker and room while the filter runs, in another process or, for recordings, in this one; engines
         without a linear stage do not need it. One learner serves one filter.
     on_barge_in : callable, optional
-        Gets the `Event` of speech that has begun, inside `process` and in the very hop, from engines that judge speech
-        (those whose `speech_probability` is not None). It should stop or duck the robot and return at once, since the
-        sound waits for it. What it raises leaves `process` when the block is filtered, and no sample is lost: the next
-        `process` or `flush` returns those of this block as well.
+        Called with the `Event` when a human's speech has begun, from inside `process` and in the same hop, if the engine
+        judges speech (`speech_probability` is not None). It should stop or duck the robot and return at once, since the
+        audio waits for it. An exception that it raises is raised by `process` after the block is filtered; no sample is
+        lost, the next `process` or `flush` returns those of this block as well.
     keep_channels : bool
-        Keep what the linear stage leaves of each microphone, for `robot_removed`.
+        Keep the output of the linear stage for each microphone channel, for `robot_removed`.
 
     Attributes
     ----------
@@ -231,8 +231,8 @@ class EgoFilter:
         aligner = self._stream.front.aligner
         if aligner and not aligner.announce(as_samples(utterance, "utterance")):
             raise SignalError(
-                f"announced speech waits to be heard, and with this more than {MOST_ANNOUNCED} utterances or"
-                f" {MOST_ANNOUNCED_S} s would, expected fewer: announce an utterance when the one before it begins"
+                f"with this more than {MOST_ANNOUNCED} announced utterances or {MOST_ANNOUNCED_S} s of them would wait to be"
+                " played: announce an utterance when the one before it begins to play"
             )
 
     def events(self) -> list[Event]:

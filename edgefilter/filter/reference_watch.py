@@ -125,7 +125,7 @@ class ReferenceWatch:
         if not removal.unpredicted or self.verdict == "late" or not self._once("unpredicted"):
             return ""
         return (
-            f"the linear stage removes {removal.removed_db:.1f} dB of the robot: the microphone seems to be processed, the"
+            f"the linear stage removes only {removal.removed_db:.1f} dB of the robot: the microphone seems to be processed, the"
             " loudspeaker distorts, or the reference is of another recording; switch off noise suppression, gain control and"
             " echo cancellation of the device, and turn the volume down"
         )
@@ -148,7 +148,7 @@ class ReferenceWatch:
         )
 
     def _listen_without(self, played: float, aligned: Aligned, frame: Frame, speaking: bool) -> str:
-        """Learn what the robot sounds like, and listen for it where the reference is silent."""
+        """Learn the spectrum of the robot at the microphone, and look for it there while the reference is silent."""
         now = self._ref.end
         if played > FELL_SILENT * self._played:
             self._played_at, self.without = now, False
@@ -167,7 +167,8 @@ class ReferenceWatch:
         self.without = robot
         return robot * (
             f"the reference has been silent for {(now - self._played_at) / SAMPLE_RATE:.0f} s, while the microphone hears what"
-            " sounds like the robot: nothing of it is removed, and nobody is noticed; the output device may have changed"
+            " sounds like the robot: it is not removed, and no speech is reported; was the robot's output moved to another"
+            " device?"
         )
 
     def _look(self, aligned: Aligned) -> list[tuple[EventKind, str]]:

@@ -13,7 +13,7 @@ from edgefilter.filter.volume import AUDIBLE, FORGET_S, PRE_EMPHASIS, pre_emphas
 from edgefilter.types import SAMPLE_RATE, Samples
 
 BLOCK, BLOCKS, ENOUGH = 16, 20, 12
-"""Hops of audible robot in a block, 0.25 s; blocks that are remembered, 5 s; blocks before anything is said, 3 s."""
+"""Hops with audible echo in a block, 0.25 s; blocks that are kept, 5 s; blocks that a figure needs at least, 3 s."""
 SETTLED = 0.3
 """Expected power of the misalignment over that of the error, -5 dB, below which the filter has learned what it can: far-end
 blocks of 18 real devices that the filter went on improving by more than 3 dB had more, but for 1 in 20."""
@@ -21,7 +21,7 @@ LITTLE_DB = 3.0
 """Removed of the robot, dB, below which its echo counts as unpredicted. Of 27 real recordings, tuned on, those with a loopback
 as it should be keep 4 dB or more, but for the processed microphone gf_0sKU1J (2.6 dB at first, later 0.8)."""
 MUCH_DB = 6.0
-"""Removed of the robot at any time from which on its echo is known to be predictable: what is less later has other causes."""
+"""ERLE, dB, that once reached shows that the echo is linear in the reference: if it is less later, that has another cause."""
 FOLLOWS = 0.4
 """Correlation of the log powers of error and reference from which on what is left is the robot: 0.5 to 0.6 on that
 microphone; where a human talks all the time -0.1 to 0.3."""
@@ -46,7 +46,7 @@ class Removal:
         self.unpredicted = False
 
     def step(self, mic: Samples, reference: Samples, found: CancellerOutput) -> None:
-        """Take one hop (hop,) of the microphone and of the reference at a known lag, and what the linear stage made of them."""
+        """Take one hop (hop,) of the microphone and of the delay-aligned reference, with the linear stage's output for it."""
         emphasised = pre_emphasised(np.array((mic, found.error, reference, found.innovation)))
         heard, left, played, innovation = np.einsum("ij,ij->i", emphasised, emphasised).tolist()
         self._peak = max(played, self._forget * self._peak)
@@ -65,7 +65,9 @@ class Removal:
 
     @property
     def removed_db(self) -> float | None:
-        """By how much the microphone is lowered, dB, in the better half of the last 5 s of robot: the other may hold a human.
+        """Echo return loss enhancement, dB, over that half of the last 5 s of robot speech in which it is higher.
+
+        The other half may hold a human, which the filter rightly leaves.
 
         None before 3 s.
         """

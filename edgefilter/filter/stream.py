@@ -176,7 +176,7 @@ class Stream:
         if self._keep_channels and self.front.linear:
             self._removed.append(np.atleast_2d(self.front.linear.error).T)
         if aligned and aligned.realigned:
-            self._tell("realigned", f"reference arrives after {1000 * aligned.delay / SAMPLE_RATE:.1f} ms")
+            self._tell("realigned", f"echo found {1000 * aligned.delay / SAMPLE_RATE:.1f} ms after the reference")
         if self._watch and aligned and (stage := self.front.linear_stage):
             speaking = self.barge_in.speaking
             for kind, detail in self._watch.step(self.front.heard, ref, aligned, frame, stage.removal, speaking):

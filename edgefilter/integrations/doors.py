@@ -1,4 +1,4 @@
-"""Who may come in where a program listens: which addresses are its own, and what the event loop complains of in one line."""
+"""What services that listen on a port share: telling local addresses from others, and one line for an error of asyncio."""
 
 from __future__ import annotations
 

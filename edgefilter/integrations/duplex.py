@@ -32,8 +32,8 @@ LOOK_S, STALL_S = 0.15, 0.25
 """How long a small delay of the microphone must last to count as lost sound, longer than transports of 100 ms are quiet; and
 a delay that counts after a tenth of that: a program that stood still for so long finds all that it has missed waiting."""
 WAITED_S, HELD_S = 1e-3, 0.1
-"""Seconds between two calls from which on nothing was waiting: a program that is behind calls at once; and a delay for which
-the microphone's sound is held back until it is decided, within 0.1 s, whether it was lost."""
+"""WAITED_S: least gap between two calls, in seconds, that shows that the caller has no backlog; one that is behind calls again
+at once. HELD_S: a delay from which on the microphone's samples are buffered until it is clear whether some were lost."""
 BACK_S = 2.0
 """Seconds of reference that are kept, to be used again where sound that seemed lost comes after all."""
 PATIENCE_S = 0.12
@@ -173,12 +173,13 @@ class Duplex:
             self._paused = False
 
     def hear(self, samples: Samples, rate: int, at_s: float | None = None) -> Samples:
-        """Take the microphone's next samples at rate and return finished samples of the human (m,), at the same rate.
+        """Take the microphone's next samples and return the human's samples that are ready, (m,), at the same rate.
 
-        samples: float, full scale +-1, (n,), of an array (n, channels), as many channels in each call. at_s: when the first of
-        them was recorded, by the sender's clock, where that is known; sound that was lost on the way shows by it at once. One
-        call may return none or more than came in. All together are as many as came in, later by the filter's latency and, at
-        another rate than 16 kHz, by the resamplers' 3.5 ms each way. Raises SignalError as `EgoFilter.process` does.
+        samples: float, full scale +-1, (n,), or (n, channels) of a microphone array, the same number of channels in every
+        call. at_s: when the first of them was recorded, seconds of the sender's clock; give it if it is known, since samples
+        that were lost on the way are then noticed at once. One call may return no samples, or more than it was given; all
+        calls together return as many as came in, delayed by the filter's latency and, at rates other than 16 kHz, by 3.5 ms
+        for each of the two resamplers. Raises SignalError as `EgoFilter.process` does.
         """
         if self._wanted is not None:
             samples = taken(np.reshape(samples, (len(samples), -1)), self._wanted)

@@ -41,13 +41,13 @@ AHEAD_S, BEHIND_S, TURNS = 0.1, 2.0, 10
 ahead of that waits, one client after the other, so many turns of the event loop a part: in five a message of 20 ms, which is
 due, goes all its way."""
 PATIENCE_S, IDLE_S = 5.0, 60.0
-"""For how long a client may take for its handshake, its first message, and reading an answer; and for any later message."""
+"""Timeouts, s: for the handshake, the first message and the reading of an answer each; and for every later message."""
 READ_AT_ONCE, MOST_FRAMES = 4096, 1000
 """Bytes that are read of a client before others have their turn, 20 ms of two channels at 48 kHz: in frames without
 content, of 6 bytes, these take 5 ms. And frames of a message, of at least that size where it is of MOST_BYTES."""
 MOST_PINGS, MOST_UNREAD = 100, 1 << 16
-"""Pings in a row without a message, which no pause between messages makes useful; bytes of answers to them and others that
-wait in this process for a client to read."""
+"""Limits that keep a client from filling the memory: pings in a row with no message between them; bytes of answers, those to
+pings among them, that wait for the client to read them."""
 GUESTS = 16
 """Connections that have no stream yet, or none any more; where one more comes, the oldest of them is cut off."""
 _LOGGER = logging.getLogger(__name__)
@@ -117,7 +117,7 @@ class Session:
             yield from self._filter(mic, ref)
 
     def finish(self) -> Iterator[list[Answer]]:
-        """The rest, and the last answer, with the figures; nothing where they were given."""
+        """The filter's last samples and the closing message with the statistics; nothing once they have been returned."""
         if self.ended:
             return
         nothing = _microphones_of(b"", self.form.microphones), np.zeros(0, np.float32)
@@ -266,7 +266,9 @@ class Service:
         self._learning += learns
         ego = None
         try:
-            async with self._making:  # many at once would hold the interpreter's lock for as many turns
+            async with (
+                self._making
+            ):  # one at a time: several would hold the interpreter's lock and delay the others' sound
                 ego = await asyncio.to_thread(self._make, learns)
             session = Session(form, ego)
             await self._send(connection, deque([session.ready(learns)]))
@@ -374,7 +376,7 @@ async def _message(connection: ServerConnection, patience_s: float) -> bytes | s
     try:
         return await asyncio.wait_for(whole(), patience_s)
     except (TimeoutError, asyncio.TimeoutError):
-        raise SignalError(f"nothing was heard for {patience_s:.0f} s: send sound, or end the session") from None
+        raise SignalError(f"no message came for {patience_s:.0f} s: send sound, or end the session") from None
 
 
 def _refuse(connection: ServerConnection, why: str) -> None:

@@ -123,7 +123,7 @@ class _Order:
         if len(self._waiting) > MOST_WAITING:
             raise SignalError(
                 f"{len(self._waiting)} messages wait for number {self._next} of their stream, expected {MOST_WAITING} at"
-                " most: count each stream's messages by one, and its samples"
+                " most: number each stream's messages 0, 1, 2, ..., and count its samples without gaps"
             )
 
     def _drain(self, lost: bool) -> Iterator[tuple[int, bytes, bool]]:
@@ -170,8 +170,8 @@ class TwoStreams:
         sound = self._mic.nbytes + self._ref.nbytes + sum(part.nbytes for _, part in self._early)
         if (waiting := sound + self._mic_order.bytes + self._ref_order.bytes) > MOST_WAITING_BYTES:
             raise SignalError(
-                f"{waiting} bytes wait for other messages, expected {MOST_WAITING_BYTES} at most: number each stream's"
-                " messages by one, and send a reference no sooner than its microphone"
+                f"{waiting} bytes wait for messages that are missing, expected {MOST_WAITING_BYTES} at most: number each"
+                " stream's messages 0, 1, 2, ..., and do not send the reference ahead of the microphone"
             )
 
     def take(self, last: bool = False) -> tuple[Samples, Samples]:

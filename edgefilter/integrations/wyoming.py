@@ -54,8 +54,8 @@ MOST_BYTES = round(MOST_QUEUED_S * SAMPLE_RATE) * np.int16().itemsize
 RETRY_S = 1.0
 """Between two attempts to reach the microphone."""
 MOST_DATA, OVERHEAD, MOST_CLIENTS = 1 << 16, 512, 8
-"""Bytes of what a message says of its sound, as much as its first line may have; bytes that a message takes beside its sound;
-and clients of a service at a time, each of which may send so much."""
+"""Limits that keep a client from filling the memory: bytes of a message's description of its sound, as many as its first
+line may have; bytes of memory that each message costs beside its sound; clients that may be connected at once."""
 AHEAD_S = 0.5
 """Speech that the loudspeaker gets before its turn: the size of aplay's buffer. The rest is still here when it is dropped."""
 UNDER_WAY_S = BargeInSettings.min_silence_s + BEFORE_S
@@ -205,7 +205,7 @@ class _BoundedReader:
 
     async def readline(self) -> bytes:
         line = await self._reader.readline()
-        with contextlib.suppress(ValueError, AttributeError):  # who asked reads it again, and says so
+        with contextlib.suppress(ValueError, AttributeError):  # the caller parses it again and reports the error
             size = json.loads(line).get("data_length")
             if (
                 isinstance(size, int | float) and size > MOST_DATA
@@ -487,7 +487,7 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--mic-uri", default=MIC_URI, help="where satellites find the microphone")
     parser.add_argument("--snd-uri", default=SND_URI, help="where satellites find the loudspeaker")
     parser.add_argument("--asr-uri", default=ASR_URI, help="where Home Assistant finds the recogniser")
-    told = "let other machines in: whoever reaches the ports hears the microphone and speaks, without a password"
+    told = "let other machines connect: there is no password, so whoever reaches the ports can hear the microphone and play sound"
     parser.add_argument("--open", action="store_true", help=told)
     parser.add_argument("--stop-for-speech", action="store_true", help="fall silent when the human begins to speak")
     args = parser.parse_args(words)

@@ -59,7 +59,7 @@ def test_one_file_given_twice_is_said_and_nothing_is_learned_from_it(files, caps
 
 def test_a_verdict_in_words():
     assert verdict_lines(Verdict(31.25, 98.4, 1, ())) == [
-        "the robot alone was lowered by 31.2 dB, heard 98 ms after the reference; a human was noticed once"
+        "while it talked alone, the robot was lowered by 31.2 dB, heard 98 ms after the reference; a human was noticed once"
     ]
     assert verdict_lines(Verdict(None, None, None, ("it is late",))) == ["wrong: it is late"]
     assert verdict_lines(Verdict(3.0, None, 4, ()))[0].endswith("lowered by 3.0 dB; a human was noticed 4 times")

@@ -503,7 +503,7 @@ def test_a_client_that_says_nothing_is_let_go(monkeypatch):
         async with serving("linear") as address, connect(address) as server:
             return json.loads(await server.recv())["detail"]
 
-    assert "nothing was heard" in run(talk())
+    assert "no message came" in run(talk())
 
 
 def skipping(step, size):
@@ -518,15 +518,19 @@ def references(size):
 
 ANNOUNCED = [json.dumps({"kind": "announce"}), pcm(np.full(500_000, 0.1))]
 HOARDS = {
-    "numbers that skip": ({"streams": "two"}, skipping(2, 20), "64 at most: count each stream's messages by one"),
-    "large numbers that skip": ({"streams": "two"}, skipping(2, 3_900_000), "bytes wait for other messages"),
-    "references before any microphone": ({"streams": "two"}, references(3_900_000), "bytes wait for other messages"),
+    "numbers that skip": ({"streams": "two"}, skipping(2, 20), "64 at most: number each stream's messages"),
+    "large numbers that skip": ({"streams": "two"}, skipping(2, 3_900_000), "bytes wait for messages that are missing"),
+    "references before any microphone": (
+        {"streams": "two"},
+        references(3_900_000),
+        "bytes wait for messages that are missing",
+    ),
     "a reference that runs ahead": ({"streams": "two"}, [HEADER.pack(0, 0, 0), *references(400_000)], "bytes wait"),
-    "announcements": ({}, ANNOUNCED * 300, "more than 64 utterances or 300 s would"),
+    "announcements": ({}, ANNOUNCED * 300, "more than 64 announced utterances or 300 s of them would"),
     "announcements of a word": (
         {},
         [ANNOUNCED[0], pcm(np.full(100, 0.1))] * 300,
-        "more than 64 utterances or 300 s would",
+        "more than 64 announced utterances or 300 s of them would",
     ),
 }
 """What a client sends that wants to be kept: its first message, the others, and what it is told."""
@@ -731,7 +735,7 @@ def test_a_client_that_falls_silent_for_good_is_told_and_leaves_its_place(monkey
             _, after = await converse(address, {}, stereo_messages(np.zeros(3200), np.zeros(3200)))
             return told["detail"], server.close_code, kinds(after)[-1]
 
-    assert run(talk()) == ("nothing was heard for 0 s: send sound, or end the session", 1008, "ended")
+    assert run(talk()) == ("no message came for 0 s: send sound, or end the session", 1008, "ended")
 
 
 @pytest.fixture
