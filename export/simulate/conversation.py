@@ -135,11 +135,7 @@ def _robot(
     echo = np.concatenate((echo, np.zeros(PRE_ROLL, np.float32)))
     if moving:
         echo = ClockDrift().apply(echo, {"ppm": ppm, "offset": 0.0}, SAMPLE_RATE)
-    told = said.told
-    if breaks := rng.random() < recipe.broken:
-        told = script.broken(rng, recipe, material.robots, told)
-    about |= {"distortion_db": round(level_db, 1), "broken": breaks}
-    return Voice(echo, said.played, told, response, about)
+    return Voice(echo, said.played, said.told, response, about | {"distortion_db": round(level_db, 1)})
 
 
 def _recorded(

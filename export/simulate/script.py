@@ -46,19 +46,6 @@ def robot(rng: np.random.Generator, recipe: Recipe, voices: Corpus, samples: int
     return Part(told, played, tuple(utterances))
 
 
-def broken(rng: np.random.Generator, recipe: Recipe, voices: Corpus, told: Samples) -> Samples:
-    """What is told to the player (n,) as a broken loopback hands it over: cut off, with samples missing, or of another recording."""
-    kind, samples = int(rng.integers(3)), told.size
-    if kind == 0:
-        return np.where(np.arange(samples) < rng.uniform(0.1, 0.7) * samples, told, np.float32(0.0))
-    if kind == 1:
-        kept = np.ones(samples, bool)
-        for at in rng.integers(samples, size=int(rng.integers(1, 40))):
-            kept[at : at + int(rng.uniform(0.002, 0.15) * SAMPLE_RATE)] = False
-        return np.concatenate((told[kept], np.zeros(samples - int(kept.sum()), np.float32)))
-    return robot(rng, recipe, voices, samples, moving=True).told
-
-
 @dataclass(frozen=True, eq=False)
 class Human:
     """The human at the microphone (n,), who it is and the names of the recordings; no speaker where nobody speaks."""
