@@ -71,7 +71,13 @@ class Output(NamedTuple):
 _Speech: TypeAlias = Literal["speech_started", "speech_stopped"]
 _Filter: TypeAlias = Literal["realigned", "overloaded", "stepped_down", "stepped_up", "learned", "unlearned"]
 _SetUp: TypeAlias = Literal[
-    "reference_missing", "reference_late", "robot_unfound", "echo_unpredicted", "same_signal", "rate_mismatch"
+    "reference_missing",
+    "reference_late",
+    "reference_gaps",
+    "robot_unfound",
+    "echo_unpredicted",
+    "same_signal",
+    "rate_mismatch",
 ]
 _Device: TypeAlias = Literal["lost", "overrun", "underrun", "device_gone", "device_back"]
 EventKind: TypeAlias = Literal[_Speech, _Filter, _SetUp, _Device]
@@ -104,10 +110,10 @@ class Event:
         "reference_missing", "reference_late", "robot_unfound": the reference was silent from the start or fell silent while
         the robot is heard, comes after its echo, or carries sound that is not found in the microphone, though that is
         louder then. "echo_unpredicted": the echo is found, and hardly any of it can be subtracted. "same_signal": the
-        microphone is the reference. "rate_mismatch": a plugin's or a service's sound comes at
-        another pace than its rate and channels say. Only from `edgefilter run`: "lost", "overrun", "underrun" (samples
-        that the sound devices lost, callbacks that came too late), "device_gone", "device_back" (a device stopped, so
-        that silence stands in for it, and runs again).
+        microphone is the reference. "rate_mismatch": a plugin's or a service's sound comes at another pace than its rate and
+        channels say, or the loudspeaker plays at another one. "reference_gaps": the reference loses samples. Only from
+        `edgefilter run`: "lost", "overrun", "underrun" (samples that the sound devices lost, callbacks that came too late),
+        "device_gone", "device_back" (a device stopped, so that silence stands in for it, and runs again).
     sample : int
         By which sample of the microphone, in whole hops.
     detail : str

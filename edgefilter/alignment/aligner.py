@@ -16,8 +16,11 @@ from edgefilter.alignment.utterances import AHEAD, Announcements, FirstSounds, O
 from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, AlignmentCounts, AlignmentState, AlignmentStats, Samples
 
-MOST_LAG_S = 2.0
-"""Lag of the playback up to which it is found: of speech that comes in a burst and is played later, over a network."""
+MOST_LAG_S, LIKELY_LAG_S = 3.0, 2.0
+"""Lag of the playback up to which it is found: of speech that comes in a burst and is played later, over a network; and up to
+which an utterance is waited for: one that is heard later is rarer than a loudspeaker that is muted."""
+LATE = SAMPLE_RATE // 10
+"""Samples by which a reference may come after its echo and is still found, to be told of."""
 SEARCH_STRIDE = 768
 """Samples between two searches of the whole range."""
 COARSE_MARGIN = 400
@@ -49,7 +52,8 @@ class Aligner:
     def __init__(self, hop: int, profile: Profile | None = None, max_lag_s: float = MOST_LAG_S) -> None:
         self.hop = hop
         self._max_lag = int((max_lag_s + 0.1) * SAMPLE_RATE)
-        self._latest = self._max_lag + SAMPLE_RATE // 4  # samples from the beginning of an utterance until it is heard
+        # samples from the beginning of an utterance until it is heard, most likely and at most
+        self._likely, self._latest = (int((s + 0.35) * SAMPLE_RATE) for s in (min(max_lag_s, LIKELY_LAG_S), max_lag_s))
         self._calibrated = None if profile is None else list(profile.running_responses())
         self._first = FirstSounds(hop, self._calibrated[0]) if self._calibrated else None
         kernel_table()
@@ -59,7 +63,7 @@ class Aligner:
         """What an arrival looks like from now on: the microphones' impulse responses (taps,); None: anything."""
         self._responses = responses
         early = None if responses is None else [one[: PRE_ROLL + REFLECTIONS] for one in responses]
-        self._lags = LagSearch(self._max_lag, early)
+        self._lags = LagSearch(self._max_lag, early, LATE)
         self._meter = DelayMeter(None if responses is None else responses[self._used[0]])
 
     def reset(self) -> None:
@@ -170,7 +174,7 @@ class Aligner:
             return "coarse" if self._audible() else "idle"
         begun = [utterance.start for utterance in self._open if not utterance.lost]
         if begun and (self._known or self._audible()):
-            return "begun" if self._ref.end <= begun[-1] + self._latest else "unfound"
+            return "begun" if self._ref.end <= begun[-1] + self._likely else "unfound"
         if not self._audible():
             return "idle"
         if self._open and self._known:
@@ -367,7 +371,7 @@ class Aligner:
         Never after an utterance that failed to arrive: the loudspeaker may be muted, or be headphones.
         """
         waits = False
-        if self._open and not self._missed and self._ref.end <= self._open[0].start + self._latest:
+        if self._open and not self._missed and self._ref.end <= self._open[0].start + self._likely:
             waits = self._refuted or not (self._coarse or self._open[0].lost)
         if self._first is None:
             return waits and self._onsets.varies and (self._refuted or not self._known)

@@ -62,9 +62,12 @@ class Candidate:
         return self.heard > WINDOW + BETWEEN + MINIMUM and self.evidence > CERTAIN_EARLY
 
     def certain(self, again: bool) -> bool:
-        """Whether it is beyond chance. again: the search before has found it as well."""
+        """Whether it is beyond chance. again: the search before has found it as well.
+
+        A reference after its echo is rare: it is believed only once the window before shows it too (see `old`).
+        """
         enough = CERTAIN_EARLY if again and self.heard <= EARLY else CERTAIN
-        return self.evidence > enough and self.heard <= WINDOW
+        return self.evidence > enough and self.heard <= WINDOW and self.lag >= 0
 
 
 class LagSearch:
@@ -78,9 +81,9 @@ class LagSearch:
     can be spread over three hops; while the reference to be looked at is short, so are the transforms.
     """
 
-    def __init__(self, max_lag: int, responses: Sequence[Samples] | None = None) -> None:
-        self.max_lag = max_lag
-        self.span = self._size = COARSE * fft.next_fast_len(-(-(max_lag + WINDOW) // COARSE), real=True)
+    def __init__(self, max_lag: int, responses: Sequence[Samples] | None = None, early: int = 0) -> None:
+        self._max_lag, self._early = max_lag, early
+        self.span = self._size = COARSE * fft.next_fast_len(-(-(max_lag + early + WINDOW) // COARSE), real=True)
         self._signed = responses is not None
         self._short = COARSE * fft.next_fast_len(-(-self.span // (2 * COARSE)), real=True)
         sizes = (self.span, self._short, WINDOW + 2 * ASIDE)
@@ -88,9 +91,9 @@ class LagSearch:
 
     def prepare(self, ref: Tape | Playback, now: int, since: int) -> None:
         """Take the reference between the positions since and now."""
-        self._size = size = self._short if now - since <= self._short - WINDOW else self.span
-        self._reach = min(self.max_lag, size - WINDOW)
-        first = max(since - (now - size), 0)
+        self._size = size = self._short if now - since <= self._short - self._early - WINDOW else self.span
+        self._lags = self._early + min(self._max_lag, size - self._early - WINDOW)
+        first = max(since - (now - size), self._early)
         r = np.zeros(size, np.float32)
         r[first:] = ref.read(now - size + first, now)
         _soften(r[first:])
@@ -130,7 +133,8 @@ class LagSearch:
         together = self._best(*self._scored(np.add.reduce(self._crosses)))
         if together is None or together.evidence <= max(first.evidence if first else 0.0, CERTAIN_EARLY):
             return first
-        near = slice(max(together.lag - NEAR, 0), together.lag + NEAR)
+        at = together.lag + self._early
+        near = slice(max(at - NEAR, 0), at + NEAR)
         alone = [self._scored(cross) for cross in self._crosses]
         return together if sum(score[near].max() > SEEN * spread for score, spread in alone) > 1 else first
 
@@ -139,24 +143,26 @@ class LagSearch:
         late = self._at - self._prepared
         overlap = self._overlap(late)
         if overlap.max() <= 0.0:
-            return np.zeros(self._reach, np.float32), 0.0
-        correlation = fft.irfft(cross, self._size)
-        score = np.concatenate((correlation[self._size - late :], correlation[: self._reach - late]))
+            return np.zeros(self._lags, np.float32), 0.0
+        correlation, before = fft.irfft(cross, self._size), late + self._early
+        score = np.concatenate((correlation[self._size - before :], correlation[: self._lags - before]))
         if not self._signed:
             np.abs(score, out=score)
-        score *= np.repeat(1.0 / np.sqrt(overlap + 0.1 * overlap.max()), COARSE)[: self._reach]
-        usable = np.repeat(overlap > 0.05 * overlap.max(), COARSE)[: self._reach]
-        return score, float(np.sqrt(np.dot(score, score * usable) / np.count_nonzero(usable)))
+        score *= np.repeat(1.0 / np.sqrt(overlap + 0.1 * overlap.max()), COARSE)[: self._lags]
+        usable = np.repeat(overlap > 0.05 * overlap.max(), COARSE)[: self._lags]
+        causal, usable = score[self._early :], usable[self._early :]
+        return score, float(np.sqrt(np.dot(causal, causal * usable) / max(np.count_nonzero(usable), 1)))
 
     def _best(self, score: Samples, spread: float) -> Candidate | None:
         """The lag of the highest peak."""
-        lag = int(np.argmax(score))
-        heard = self._at - self._since - lag
+        at = int(np.argmax(score))
+        lag = at - self._early
+        heard = self._at - self._since - max(lag, 0)
         if spread <= 0.0 or heard < MINIMUM:
             return None
-        earlier, later = score[: max(lag - NEAR, 0)].max(initial=0.0), score[lag + REFLECTIONS :].max(initial=0.0)
-        second = max(earlier, REFLECTED * score[lag + NEAR : lag + REFLECTIONS].max(initial=0.0), later)
-        height = float(score[lag])
+        earlier, later = score[: max(at - NEAR, 0)].max(initial=0.0), score[at + REFLECTIONS :].max(initial=0.0)
+        second = max(earlier, REFLECTED * score[at + NEAR : at + REFLECTIONS].max(initial=0.0), later)
+        height = float(score[at])
         return Candidate(lag, height / spread, height / max(float(second), 1e-12), self._at, heard)
 
     def before(self, number: int, mic: Tape, ref: Tape | Playback, found: Candidate) -> bool:
@@ -185,7 +191,7 @@ class LagSearch:
     def _overlap(self, late: int) -> Samples:
         """Energy of the reference, first difference, that falls under the microphone's window, at every COARSE-th lag."""
         last = self._total.size - 1
-        lags = np.arange(0, self._reach, COARSE)
+        lags = np.arange(0, self._lags, COARSE) - self._early
         upper = np.clip((self._size + late - lags) // COARSE, 0, last)
         lower = np.clip((self._start + late - lags) // COARSE, 0, last)
         return (self._total[upper] - self._total[lower]).astype(np.float32)

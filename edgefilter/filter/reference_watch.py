@@ -11,10 +11,11 @@ import numpy as np
 from edgefilter.alignment.aligner import COARSE_MARGIN
 from edgefilter.alignment.delay_line import Aligned, Tape
 from edgefilter.alignment.lag_search import CERTAIN, WINDOW, LagSearch
-from edgefilter.alignment.utterances import FLOOR, OnsetDetector
+from edgefilter.alignment.utterances import FLOOR, NEVER, OnsetDetector
 from edgefilter.dsp import fourier
 from edgefilter.dsp.lag import one_signal
 from edgefilter.filter.microphones import SILENT
+from edgefilter.filter.playback_faults import LENGTH, SPEEDS, GrowingLag, other_speed
 from edgefilter.filter.removal import Removal
 from edgefilter.filter.robot_sound import LOUD, RobotSound
 from edgefilter.filter.volume import pre_emphasised
@@ -26,8 +27,9 @@ SEARCH_STRIDE = SAMPLE_RATE // 4
 """Samples of an utterance between two looks for it in what the microphone heard before."""
 IN_VAIN = 6
 """Looks, 1.5 s of speech, after which an utterance that is found nowhere is taken for one that is not heard."""
-ARRIVES = 32
-"""Samples, 2 ms, by which a reference must be late to count as late: devices that share a buffer are as exact."""
+ARRIVES, IN_TIME = 32, SAMPLE_RATE
+"""Samples, 2 ms, by which a reference must be late to count as late: devices that share a buffer are as exact; and of an echo
+that is followed behind the reference, after which that is not late, whatever a look has found."""
 DOUBT = SAMPLE_RATE // 2
 """Samples for which speech that begins while the reference is silent waits for it, until it is known to come in time: an
 onset of the robot's is no human's if the reference follows."""
@@ -39,6 +41,9 @@ MISSING, HEARD = 60 * SAMPLE_RATE, 10 * SAMPLE_RATE
 converter, since there is nothing else to compare with. 16 bits by themselves are 41 dB softer."""
 FELL_SILENT = 1e-3
 """Power of the reference, over its power while the robot talks, below which it is silent, -30 dB: the noise of a loopback is."""
+SPEED_STRIDE, SPEED_LOOKS = SAMPLE_RATE, 8
+"""Samples of speech between two comparisons of the speed, and how many there are at most: the echo is not found meanwhile, and
+each costs half a hop."""
 SAME_S = 2.0
 """Seconds of sound after which microphone and reference are compared sample by sample."""
 Verdict = Literal["unknown", "fits", "late"]
@@ -62,11 +67,15 @@ class ReferenceWatch:
     def __init__(self, hop: int, bins: int) -> None:
         self._hop = hop
         self._search = LagSearch(LATEST)
-        self._mic, self._ref, self._earlier = (Tape(self._search.span) for _ in range(3))
+        self._mic, self._ref, self._earlier = (Tape(self._search.span + LENGTH) for _ in range(3))
         self._onsets = OnsetDetector(hop)
         self.verdict: Verdict = "unknown"
         self.without = self.same = False
-        self._late = self._stage = self._looks = 0
+        self._late = self._stage = self._looks = self._in_time = 0
+        self._seen_at = NEVER
+        self._growing, self._lacks = GrowingLag(), False
+        self._speed: float | None = None
+        self._off_speed, self._to_compare, self._compared = False, 0, 0
         self._to_search = SEARCH_STRIDE
         self._idle = True
         self._power = {"unfound": [0.0, 0], "idle": [0.0, 0]}
@@ -80,7 +89,12 @@ class ReferenceWatch:
     @property
     def suspect(self) -> bool:
         """Whether what is heard may be the robot, whose reference comes later or not at all."""
-        return self.without or (self.verdict == "late" and not self._idle)
+        return self.without or (self._displaced and not self._idle)
+
+    @property
+    def _displaced(self) -> bool:
+        """Whether it is known why the echo is not where the reference says."""
+        return self.verdict == "late" or self._lacks or self._off_speed
 
     @property
     def wait(self) -> int:
@@ -107,6 +121,8 @@ class ReferenceWatch:
             ("robot_unfound", self._weigh(power, aligned)),
             ("echo_unpredicted", self._unpredicted(removal)),
             ("same_signal", self._same(pre_emphasised(mic), pre_emphasised(ref))),
+            ("reference_gaps", self._lacks_samples(aligned)),
+            ("rate_mismatch", self._compare_speed(aligned)),
             (
                 "reference_missing",
                 self._wait_for_any(power, played) or self._listen_without(played, aligned, frame, speaking),
@@ -122,12 +138,52 @@ class ReferenceWatch:
 
     def _unpredicted(self, removal: Removal) -> str:
         """Say that hardly anything of the robot can be subtracted."""
-        if not removal.unpredicted or self.verdict == "late" or not self._once("unpredicted"):
+        if not removal.unpredicted or self._displaced or not self._once("unpredicted"):
             return ""
         return (
             f"the linear stage removes only {removal.removed_db:.1f} dB of the robot: the microphone seems to be processed, the"
             " loudspeaker distorts, or the reference is of another recording; switch off noise suppression, gain control and"
             " echo cancellation of the device, and turn the volume down"
+        )
+
+    def _lacks_samples(self, aligned: Aligned) -> str:
+        """Say that the lag grows again and again."""
+        if aligned.realigned:
+            self._growing.step(self._ref.end, aligned.delay)
+        grown = self._growing.grown(self._ref.end)
+        self._lacks = grown > 0
+        if not self._lacks or not self._once("gaps"):
+            return ""
+        return (
+            f"samples are missing in the reference: its echo comes later and later, by {1000 * grown / SAMPLE_RATE:.0f} ms in"
+            " the last 10 s; little of the robot is removed, and nobody is noticed while it talks; use a loopback that loses"
+            " nothing, or larger buffers"
+        )
+
+    def _compare_speed(self, aligned: Aligned) -> str:
+        """While the echo is not found, look for it at other speeds; believe what two looks in a row find."""
+        if aligned.state == "locked":
+            self._off_speed, self._speed = False, None
+            return ""
+        start = self._ref.end - round(SPEEDS[0] * LENGTH)
+        if not self._onsets.active or start < self._onsets.current.start or self._compared == SPEED_LOOKS:
+            return ""
+        self._to_compare -= self._hop
+        if self._to_compare > 0:
+            return ""
+        self._to_compare, self._compared = SPEED_STRIDE, self._compared + 1
+        before = self._speed
+        self._speed = other_speed(self._mic.read(start, start + LENGTH), self._ref.read(start, self._ref.end))
+        if self._speed is None or self._speed != before:
+            return ""
+        self._off_speed = True
+        if not self._once("speed"):
+            return ""
+        taken, has = ("44.1", "48") if self._speed > 1.0 else ("48", "44.1")
+        return (
+            f"the loudspeaker plays the reference {100 * abs(self._speed - 1.0):.1f} % {'faster' if self._speed > 1.0 else 'slower'}"
+            f" than it is given: {taken} kHz seem to be played as {has} kHz; nothing of the robot is removed, and nobody is"
+            " noticed while it talks; give the player the rate that its sound has"
         )
 
     def _same(self, mic: Samples, ref: Samples) -> str:
@@ -173,8 +229,12 @@ class ReferenceWatch:
 
     def _look(self, aligned: Aligned) -> list[tuple[EventKind, str]]:
         """One step of a search, where one is due, and what it leads to."""
-        if aligned.state in ("locked", "coarse") and self.verdict == "unknown":
-            self.verdict = "fits"
+        if aligned.state == "locked" and aligned.delay < -ARRIVES:
+            return self._found_late(round(-aligned.delay))
+        if aligned.state in ("locked", "coarse") and self.verdict != "fits":
+            self._in_time += self._hop
+            if self.verdict == "unknown" or self._in_time >= IN_TIME:
+                self.verdict = "fits"
         if not self._onsets.active:
             return []
         self._to_search -= self._hop
@@ -197,14 +257,19 @@ class ReferenceWatch:
             if self._looks >= IN_VAIN and (self.verdict == "unknown" or aligned.state == "locked"):
                 self.verdict = "fits"
             return []
-        known = self.verdict == "late"
-        self.verdict, self._late, self._looks = "late", found.lag, 0
+        again = abs(found.lag - self._seen_at) <= ARRIVES
+        self._seen_at, self._looks = found.lag, 0
+        return self._found_late(found.lag) if again else []
+
+    def _found_late(self, samples: int) -> list[tuple[EventKind, str]]:
+        """The reference is late by so many samples; what is to be said."""
+        self.verdict, self._late, self._in_time = "late", samples, 0
         told = (
-            f"the reference comes {1000 * found.lag / SAMPLE_RATE:.0f} ms after the microphone has heard it: the robot is"
+            f"the reference comes {1000 * samples / SAMPLE_RATE:.0f} ms after the microphone has heard it: the robot is"
             " not removed, and nobody is noticed while it talks; hand the reference over earlier, or the microphone later;"
             " or are the two swapped?"
         )
-        return [] if known else [("reference_late", told)]
+        return [("reference_late", told)] if self._once("late") else []
 
     def _resembles_earlier(self, lag: int) -> bool:
         """Whether the utterance resembles what the aligner says is heard of an earlier one, about that many samples before."""
@@ -227,7 +292,7 @@ class ReferenceWatch:
         if aligned.state == "locked":
             self._power["unfound"] = [0.0, 0]
             self._said.discard("unfound")
-        if aligned.state in self._power and self.verdict != "late":
+        if aligned.state in self._power and not self._displaced:
             entry = self._power[aligned.state]
             entry[0] += power
             entry[1] += self._hop

@@ -111,6 +111,6 @@ def test_more_announcements_than_may_wait_are_refused_and_those_before_still_wai
         ego = EgoFilter(engine="linear")
         for _ in range(most):
             ego.announce(utterance)
-        with pytest.raises(SignalError, match="more than 64 utterances or 300 s would"):
+        with pytest.raises(SignalError, match="more than 64 announced utterances or 300 s of them would"):
             ego.announce(utterance)
         assert ego.stats()["alignment"]["announced"] == most

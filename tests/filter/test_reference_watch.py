@@ -267,3 +267,38 @@ def test_a_linear_path_is_not_blamed_while_it_is_being_learned(seed):
     ego = EgoFilter(engine="linear")
     assert not [event for event in events(ego, mic, ref) if event.kind in SET_UP_WRONG]
     assert ego.stats()["linear_stage"]["removed_db"] > 15.0
+
+
+@pytest.mark.parametrize(("speed", "words"), [(48 / 44.1, "8.8 % faster"), (44.1 / 48, "8.1 % slower")])
+def test_a_loudspeaker_that_plays_at_another_speed_is_named_and_nobody_is_noticed_any_more(speed, words):
+    mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0][: 8 * RATE] for name in ("mic", "reference"))
+    heard = np.interp(np.arange(mic.size) * speed, np.arange(mic.size), mic).astype(np.float32)
+    said = [event for event in events(EgoFilter(engine="crnn"), heard, ref) if event.kind in SET_UP_WRONG]
+    assert [event.kind for event in said] == ["rate_mismatch"] and words in said[0].detail
+    assert said[0].sample < 6 * RATE
+
+
+def test_a_reference_that_loses_samples_is_named_and_one_whose_lag_changes_with_each_utterance_is_not(robot):
+    mic, ref = robot
+    kept = np.ones(ref.size, bool)
+    for at in range(RATE, ref.size, RATE):
+        kept[at : at + 160] = False
+    cut = np.concatenate((ref[kept], np.zeros(ref.size - int(kept.sum()), np.float32)))
+    said = [event for event in events(EgoFilter(engine="linear"), mic, cut) if event.kind in SET_UP_WRONG]
+    assert [event.kind for event in said] == ["reference_gaps"] and " ms in the last 10 s" in said[0].detail
+    assert not [event for event in events(EgoFilter(engine="linear"), mic, ref) if event.kind == "reference_gaps"]
+
+
+def test_a_reference_a_little_after_its_echo_is_told_to_the_millisecond(robot):
+    mic, ref = robot
+    said = [
+        event for event in events(EgoFilter(engine="linear"), mic, later(ref, LAG + 208)) if event.kind in SET_UP_WRONG
+    ]
+    assert [event.kind for event in said] == ["reference_late"] and " 13 ms after" in said[0].detail
+
+
+def test_a_lag_of_nearly_three_seconds_is_found(robot):
+    mic, ref = robot
+    ego = EgoFilter(engine="linear")
+    events(ego, later(mic, round(2.8 * RATE) - LAG), ref)
+    assert ego.stats()["alignment"]["delay_samples"] == pytest.approx(2.8 * RATE, abs=40)
