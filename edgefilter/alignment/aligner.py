@@ -189,11 +189,14 @@ class Aligner:
     def _expire(self) -> None:
         """Give up utterances that would have been heard by now."""
         end = self._open[1].start if len(self._open) > 1 else self._onsets.current.end
+        if self._ref.end > end + self._likely:
+            self._missed = True
+            if not self._known and self._responses is not None:  # it may stand elsewhere than where it was calibrated
+                self._stage = 0
+                self._listen_for(None)
         if self._ref.end > end + self._latest:
             self._resolve(found=False)
             self._missed = True
-            if not self._known and self._responses is not None:  # it may stand elsewhere than where it was calibrated
-                self._listen_for(None)
 
     def _resolve(self, found: bool = True) -> None:
         self._open.popleft()
