@@ -148,13 +148,15 @@ class AlignmentStats(AlignmentCounts, total=False):
     """What the aligner found.
 
     Method "tracking" has all keys but utterances_aligned; "paper" has the first, delay_samples, confidence and
-    utterances_aligned.
+    utterances_aligned. probability: that the delay is right, 0 to 1; deviation_samples: the standard deviation of the
+    delay if it is. confidence: of "tracking" the probability under its earlier name, of "paper" a correlation.
     """
 
     method: Literal["tracking", "paper"]
     state: AlignmentState
     delay_samples: float | None
     deviation_samples: float | None
+    probability: float
     confidence: float
     ppm: float
     utterances_aligned: int

@@ -11,7 +11,7 @@ import numpy as np
 from edgefilter.alignment.coarse_lag import CoarseLag
 from edgefilter.alignment.delay_line import HALF_WIDTH, Aligned, Tape, kernel_table, read_delayed, read_line
 from edgefilter.alignment.delay_tracker import DRIFTED, FAINT, SIZE, STRIDE, DelayMeasurement, DelayMeter, DriftFilter
-from edgefilter.alignment.lag_search import CERTAIN_EARLY, MINIMUM, REFLECTIONS, Candidate, LagSearch
+from edgefilter.alignment.lag_search import CERTAIN, MINIMUM, REFLECTIONS, SEEN_ODDS, Found, LagSearch
 from edgefilter.alignment.utterances import AHEAD, Announcements, FirstSounds, OnsetDetector, Playback, Utterance
 from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, AlignmentCounts, AlignmentState, AlignmentStats, Samples
@@ -26,9 +26,13 @@ SEARCH_STRIDE = 768
 COARSE_MARGIN = 400
 """Samples, 25 ms, by which the reference is read earlier than at a coarse lag, so that a canceller holds all that arrives, and
 from which on a coarse lag is another one."""
+THERE, UNSEEN, SUREST = 1.7, 0.5, 6.0
+"""What a look that sees the robot where it is expected adds to the log odds of the delay, what one that does not takes off, and the most
+that they become. In 40 measured rooms, beside humans and noise, looks at the right delay see it in 47 %, at a wrong one in 9 %."""
 LOST_BLOCKS, NEARBY_SEARCHES = 3, 10
 """Measurements in speech without a credible peak after which all lags are searched again, so often as if the present delay
-had ceased SIZE samples ago, which finds jumps of up to 200 ms, then as if the utterance had begun half a second before."""
+had ceased SIZE samples ago, which finds jumps of up to 200 ms, then as if the utterance had begun half a second before. A delay
+that no measurement has ever seen is doubted once it is more likely wrong than right, from the beginning of the utterance on."""
 
 
 class Aligner:
@@ -79,15 +83,15 @@ class Aligner:
         self._open: deque[Utterance] = deque(maxlen=32)
         self._announced = Announcements()
         self._expected: Playback | None = None
-        self._found: Candidate | None = None
-        self._doubted = self._read_at = float("nan")
+        self._found: Found | None = None
+        self._read_at = float("nan")
         self._to_search, self._to_measure, self._stage, self._far = SEARCH_STRIDE, STRIDE // 2, 0, False
         self._gain: float | None = None
         self._by_bands = None if self._calibrated else CoarseLag(self.hop, self._max_lag)
         self._coarse = False  # whether a lag is followed at which nothing sharp arrives
         self._margin = PRE_ROLL
         self._known = self._refuted = self._trusted = self._measured = self._missed = False
-        self._confidence, self._lost = 0.0, 0
+        self._log_odds, self._lost = -SUREST, 0
         self._counts = AlignmentCounts(
             utterances=0, realignments=0, jumps=0, searches=0, announced=0, announced_heard=0
         )
@@ -155,7 +159,7 @@ class Aligner:
         return read_line(self._ref, self._ref.end, count, self._read_at, self._drift.slope, chunk=512)
 
     def stats(self) -> AlignmentStats:
-        """Delay, drift, confidence, state and what happened so far, ready for JSON."""
+        """Delay, drift, how sure both are, state and what happened so far, ready for JSON."""
         return {
             "method": "tracking",
             "state": self._state(),
@@ -163,8 +167,14 @@ class Aligner:
             "deviation_samples": round(self._drift.deviation, 3) if self._known else None,
             **self._counts,
             "ppm": round(-1e6 * self._drift.slope, 2),
-            "confidence": round(self._confidence, 3),
+            "probability": round(self._probability, 3),
+            "confidence": round(self._probability, 3),
         }
+
+    @property
+    def _probability(self) -> float:
+        """That the delay is right, 0 to 1."""
+        return 1.0 / (1.0 + math.exp(-self._log_odds)) if self._known else 0.0
 
     def _state(self) -> AlignmentState:
         """What `Aligned` says of each."""
@@ -229,30 +239,22 @@ class Aligner:
             together = self._used if self._responses is not None else self._used[:1]
             self._lags.listen({at: self._mics[at] for at in together}, now, heard_out)
         elif stage == 2:
-            self._found = self._lags.find()
-            return self._found is not None and self._decide(self._found)
+            found = self._lags.find()
+            if found is not None and found.old and found.odds * SEEN_ODDS > CERTAIN:
+                self._found, self._stage = found, 3
+            return found is not None and not found.old and found.odds > CERTAIN and self._take(found)
         elif found := self._found:
             first, ref = self._used[0], self._expected or self._ref
             return self._lags.before(first, self._mics[first], ref, found) and self._take(found)
         return False
 
-    def _decide(self, found: Candidate) -> bool:
-        """Take the candidate if it is beyond chance, or have the window before looked at; True if the delay was switched."""
-        if found.old:
-            self._stage = 3
-            return False
-        place = found.lag + (self._expected.start if self._expected else 0)
-        again = abs(place - self._doubted) <= 2
-        self._doubted = place if found.evidence > CERTAIN_EARLY else float("nan")
-        return found.certain(again) and self._take(found)
-
-    def _take(self, found: Candidate) -> bool:
-        """Believe a candidate; True if the delay was switched."""
+    def _take(self, found: Found) -> bool:
+        """Believe a lag; True if the delay was switched."""
+        self._log_odds = min(math.log(found.odds * (SEEN_ODDS if found.old else 1.0)), SUREST)
         if self._expected is not None:
             return self._begin(self._expected.start + found.lag)
         was_refuted = self._refuted
         self._resolve()
-        self._confidence = min(found.strength / 20.0, 1.0)
         if self._known and abs(found.lag - self._drift.delay) < 24:
             return was_refuted
         return self._switch(float(found.lag), 3.0)
@@ -315,6 +317,7 @@ class Aligner:
     def _jump(self, offset: float) -> bool:
         """The delay has jumped by offset."""
         self._counts["jumps"] += 1
+        self._log_odds = math.log(CERTAIN)
         if self._open and self._ref.end - self._drift.delay > self._open[0].start + STRIDE:
             self._resolve()
         self._drift.step(offset, 0.3)
@@ -325,7 +328,7 @@ class Aligner:
         self._drift.correct(found)
         self._meter.confirm(found.offset)
         self._lost, self._missed = 0, False
-        self._confidence += 0.2 * (found.explained - self._confidence)
+        self._log_odds = min(self._log_odds + THERE, SUREST)
         before = found.gain if self._gain is None else self._gain
         self._gain = before + 0.1 * (min(found.gain, 2 * before) - before)
         was_refuted = self._refuted
@@ -336,12 +339,17 @@ class Aligner:
 
     def _note_loss(self, found: DelayMeasurement) -> None:
         """Speech of the robot should be heard but is not where it was expected: in the end, search everything."""
-        if self._open or self._gain is None or found.gain < FAINT * self._gain:
+        if self._open or (self._gain is not None and found.gain < FAINT * self._gain):
             return
         self._lost += 1
         self._to_measure = STRIDE // 2
-        self._confidence *= 0.9
-        if self._lost >= LOST_BLOCKS:
+        self._log_odds = max(self._log_odds - UNSEEN, -SUREST)
+        if (
+            self._gain is None and self._log_odds < 0.0
+        ):  # no look has ever seen it: it may have been wrong from the start
+            self._trusted = False
+            self._open.append(Utterance(self._onsets.current.start, self._onsets.current.end, lost=True))
+        elif self._gain is not None and self._lost >= LOST_BLOCKS:
             self._lost = 0
             self._trusted = False
             self._open.append(Utterance(self._ref.end, self._ref.end, nearby=NEARBY_SEARCHES, lost=True))
@@ -366,7 +374,7 @@ class Aligner:
             reference = np.zeros(self.hop, np.float32)
         ppm = -1e6 * self._drift.slope
         anywhere = self._at_any_lag(mic, reference, state)
-        return Aligned(reference, self._drift.delay, ppm, self._confidence, state, switched, anywhere)
+        return Aligned(reference, self._drift.delay, ppm, self._probability, state, switched, anywhere)
 
     def _at_any_lag(self, mic: Samples, reference: Samples, state: AlignmentState) -> bool:
         """What `Aligned` says of it, for a hop of the microphone and the reference at the delay of before.

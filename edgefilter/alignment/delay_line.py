@@ -21,14 +21,15 @@ class Aligned(NamedTuple):
 
     reference: (hop,) float32, delayed so that the robot's direct sound lies PRE_ROLL samples behind it; zeros while no
     delay is known. delay: samples, of the direct sound at the end of the hop, nan if unknown. ppm: by how much it shrinks,
-    1e-6 samples per sample. confidence: 0 to 1. realigned: the delay was switched discontinuously in this hop. state: of
-    the utterance that may be heard now. "idle": nothing of the reference can be audible. "announced": it is waited for, and
-    may begin at any time or never. "begun": it has begun and is not found yet; delay is the one of before, or nan.
-    "unfound": as "begun", but it should have been heard by now, whatever its lag. "coarse": no sharp arrival was found
-    yet, the delay is known to within 25 ms; the reference is early by as much. "lost": it was found, but the last looks did
-    not see it, beside a loud human or after a jump; delay is carried on, with its drift. "locked": its delay is followed.
-    at_any_lag: what is heard may be an utterance at a lag that nobody knows: it was not found so far, and no delay is
-    known, or the one of before was refuted; of a calibrated robot, it is too loud for anybody else (FirstSounds).
+    1e-6 samples per sample. confidence: probability that the delay is right, 0 to 1. realigned: the delay was switched
+    discontinuously in this hop. state: of the utterance that may be heard now. "idle": nothing of the reference can be
+    audible. "announced": it is waited for, and may begin at any time or never. "begun": it has begun and is not found yet;
+    delay is the one of before, or nan. "unfound": as "begun", but it should have been heard by now, whatever its lag.
+    "coarse": no sharp arrival was found yet, the delay is known to within 25 ms; the reference is early by as much. "lost":
+    it was found, but the last looks did not see it, beside a loud human or after a jump; delay is carried on, with its
+    drift. "locked": its delay is followed. at_any_lag: what is heard may be an utterance at a lag that nobody knows: it was
+    not found so far, and no delay is known, or the one of before was refuted; of a calibrated robot, it is too loud for
+    anybody else (FirstSounds).
     """
 
     reference: Samples

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from edgefilter.alignment.delay_line import Tape
-from edgefilter.alignment.lag_search import CERTAIN, CERTAIN_EARLY, NEAR
+from edgefilter.alignment.lag_search import NEAR
 from edgefilter.alignment.utterances import FLOOR
 from edgefilter.dsp import fourier
 from edgefilter.dsp.fourier import power
@@ -26,11 +26,14 @@ REACH = 1024
 SIZE = FRAME + 2 * REACH
 EARLY = (48, 400)
 """Samples before and after the direct sound that the learnt response keeps."""
-SMALL, FAR_JUMP = 8.0, 50.0
+SMALL, CERTAIN_SMALL, CERTAIN, CERTAIN_FAR = 8.0, 20.0, 30.0, 50.0
 """A jump is believed from CERTAIN of evidence on, summed over looks that agree; one of up to SMALL samples from
-CERTAIN_EARLY on, and one beyond REACH from FAR_JUMP on, for chance has more to choose from. In 7 minutes of human speech
+CERTAIN_SMALL on, and one beyond REACH from CERTAIN_FAR on, for chance has more to choose from. In 7 minutes of human speech
 while the reference played unheard, the sums reached 19 within REACH and 29 beyond. Their tails are exponential: 30 comes
 about once in 100 hours of such speech, 50 beyond REACH once in 5 if all looks went that far."""
+ONE_LOOK = 28.0
+"""Evidence that one look can have at most: what is heard in an eighth of a second through a microphone that is processed may agree
+with the reference at any delay, so a jump of more than SMALL samples takes two looks that agree."""
 AGREE = 0.7
 """Samples within which two looks see the same jump."""
 FORGET = 0.7
@@ -346,13 +349,14 @@ class JumpWitness:
 
     def convinced(self, found: DelayMeasurement) -> bool:
         """Take in a look at which the delay seems to have jumped by its offset; True if that is now beyond chance."""
+        evidence = min(found.evidence, ONE_LOOK)
         if abs(found.offset - self._offset) < AGREE:
-            self._evidence += found.evidence
+            self._evidence += evidence
         else:
             self._evidence *= FORGET
-            if found.evidence <= self._evidence:
+            if evidence <= self._evidence:
                 return False
-            self._evidence = found.evidence
+            self._evidence = evidence
         self._offset = found.offset
         size = abs(found.offset)
-        return self._evidence > (CERTAIN_EARLY if size <= SMALL else CERTAIN if size <= REACH else FAR_JUMP)
+        return self._evidence > (CERTAIN_SMALL if size <= SMALL else CERTAIN if size <= REACH else CERTAIN_FAR)

@@ -251,8 +251,7 @@ class ReferenceWatch:
 
     def _decide(self, aligned: Aligned) -> list[tuple[EventKind, str]]:
         found = self._search.find()
-        certain = found is not None and found.evidence > CERTAIN and found.lag >= ARRIVES
-        if found is None or not certain or self._resembles_earlier(found.lag):
+        if found is None or found.odds < CERTAIN or found.lag < ARRIVES or self._resembles_earlier(found.lag):
             self._looks += 1
             if self._looks >= IN_VAIN and (self.verdict == "unknown" or aligned.state == "locked"):
                 self.verdict = "fits"

@@ -211,8 +211,8 @@ def test_a_lag_of_nearly_two_seconds_is_found(path):
 
 def test_a_coarse_lag_and_a_sharp_arrival_may_be_found_in_the_same_hop():
     """Nothing had been read at the coarse lag yet: not a number of samples."""
-    rng = np.random.default_rng(306)
-    x, lag = voice(306 % 40, 4.0), rng.integers(500, 4000)
+    rng = np.random.default_rng(443)
+    x, lag = voice(443 % 40, 4.0), rng.integers(500, 4000)
     path = rng.standard_normal(rng.integers(200, 3000))
     path *= np.exp(-np.arange(path.size) / rng.uniform(50, 1500))
     path[0] += rng.uniform(0, 8)

@@ -69,11 +69,17 @@ def test_a_look_may_err_by_a_tenth_of_a_sample_where_it_explains_nothing(explain
         (look(100.0, gain_there=10.1), "unseen"),
         (look(959.0), "elsewhere"),
         (look(-961.0), "unseen"),
-        (look(100.0, ratio=3.1), "jumped"),
+        (look(100.0, ratio=9.0), "elsewhere"),
     ],
 )
 def test_a_look_counts_where_its_peak_stands_out_and_the_robot_is_as_loud_as_it_was(found, what):
     assert seen(found) == what
+
+
+def test_two_looks_that_see_the_robot_elsewhere_see_a_jump():
+    drift = DriftFilter()
+    drift.restart(1000.0, 0.05)
+    assert [drift.where_seen(look(100.0, ratio=1.6), 1.0, False) for _ in range(2)] == ["elsewhere", "jumped"]
 
 
 def test_a_far_look_sees_three_times_as_far():
@@ -82,8 +88,9 @@ def test_a_far_look_sees_three_times_as_far():
 
 @pytest.mark.parametrize(("offset", "enough"), [(8.0, 20.0), (8.1, 30.0), (1024.0, 30.0), (-1025.0, 50.0)])
 def test_a_jump_is_believed_from_so_much_evidence_on_as_chance_has_places(offset, enough):
-    assert not JumpWitness().convinced(look(offset, 1.0, 0.99 * enough))
-    assert JumpWitness().convinced(look(offset, 1.0, 1.01 * enough))
+    for share, believed in ((0.99, False), (1.01, True)):
+        witness, half = JumpWitness(), look(offset, 1.0, 0.5 * share * enough)
+        assert [witness.convinced(half) for _ in range(2)] == [False, believed]
 
 
 @pytest.mark.parametrize(("further", "believed"), [(0.69, True), (0.71, False), (-0.69, True)])

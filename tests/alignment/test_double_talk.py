@@ -165,7 +165,7 @@ def test_a_robot_that_is_hidden_is_lost_after_three_looks_two_hops_apart():
     first = hidden.start // 256
     lost = [a.state for a in hops].index("lost")
     confidence = np.array([a.confidence for a in hops[first : lost + 1]])
-    missed = np.flatnonzero(np.isclose(confidence[1:], 0.9 * confidence[:-1], rtol=1e-9))
+    missed = np.flatnonzero(np.isclose(np.diff(np.log(confidence / (1.0 - confidence))), -0.5))  # of the log odds
     assert len(missed) == 3 and np.all(np.diff(missed) == 2) and first + 1 + missed[-1] == lost
 
 
