@@ -78,7 +78,8 @@ the slowest took 2.3 s."""
 class Verdict:
     """What a run came to.
 
-    removed_db: by how much the robot alone was lowered; lag_ms: of its voice behind the reference; either may be None.
+    removed_db: by how much the robot alone was lowered, None where it was not found; lag_ms: of its voice behind the reference,
+    negative where the reference came later, None where it is not known.
     noticed: how often a human was, None where the engine does not judge it. wrong: what was set up wrongly, a sentence each.
     """
 
@@ -98,9 +99,10 @@ class Verdict:
                 f"the reference carries {progress.robot_s:.0f} s of sound, and nothing of it is found in the microphone: is it from"
                 " another recording, or was the loudspeaker muted, or were headphones used?"
             ]
-        lag_ms = None if lag is None else abs(1000 * lag / SAMPLE_RATE)
+        lag_ms = None if lag is None else 1000 * lag / SAMPLE_RATE
         noticed = sum(event.kind == "speech_started" for event in kept) if judges else None
-        return cls(progress.lowered_db, lag_ms, noticed, tuple(wrong))
+        heard = not alignment or lag is not None or found
+        return cls(progress.lowered_db if heard else None, lag_ms, noticed, tuple(wrong))
 
 
 @dataclass

@@ -279,7 +279,8 @@ def verdict_lines(verdict: Verdict) -> list[str]:
     """How much of the robot was removed, at which lag, how often a human was noticed, and what was wrong, a line each."""
     told = []
     if verdict.removed_db is not None:
-        after = "" if verdict.lag_ms is None else f", heard {verdict.lag_ms:.0f} ms after the reference"
+        lag = verdict.lag_ms
+        after = "" if lag is None else f", heard {abs(lag):.0f} ms {'before' if lag < -0.5 else 'after'} the reference"
         told.append(f"while it talked alone, the robot was lowered by {verdict.removed_db:.1f} dB{after}")
     if verdict.noticed is not None:
         times = "never" if not verdict.noticed else "once" if verdict.noticed == 1 else f"{verdict.noticed} times"

@@ -58,7 +58,7 @@ def advice(found: Passport) -> list[str]:
     """What to change, the most important first."""
     if not found.found:
         return [
-            "Check that the recording holds the robot, and that the reference is what was played, not earlier than 2 s before;"
+            "Check that the recording holds the robot, and that the reference is what was played, not earlier than 3 s before;"
             " `edgefilter doctor` finds wrong connections."
         ]
     told = [FIRST[found.cause]] if found.cause in FIRST else []

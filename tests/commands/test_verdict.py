@@ -47,6 +47,7 @@ def test_a_run_says_how_much_of_the_robot_was_removed_at_which_lag_and_how_often
 def test_a_reference_of_another_recording_is_said_at_the_end(files, capsys):
     figures, told = ran(files, "mic", "other", capsys, "--engine", "linear", "--no-learn")
     assert figures["verdict"]["lag_ms"] is None and len(figures["verdict"]["wrong"]) == 1
+    assert figures["verdict"]["removed_db"] is None and "lowered" not in told
     assert "wrong: the reference" in told or "wrong: the microphone" in told
 
 
@@ -62,6 +63,7 @@ def test_a_verdict_in_words():
         "while it talked alone, the robot was lowered by 31.2 dB, heard 98 ms after the reference; a human was noticed once"
     ]
     assert verdict_lines(Verdict(None, None, None, ("it is late",))) == ["wrong: it is late"]
+    assert "heard 23 ms before the reference" in verdict_lines(Verdict(3.0, -23.4, 4, ()))[0]
     assert verdict_lines(Verdict(3.0, None, 4, ()))[0].endswith("lowered by 3.0 dB; a human was noticed 4 times")
 
 
