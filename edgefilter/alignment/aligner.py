@@ -242,7 +242,9 @@ class Aligner:
             found = self._lags.find()
             if found is not None and found.old and found.odds * SEEN_ODDS > CERTAIN:
                 self._found, self._stage = found, 3
-            return found is not None and not found.old and found.odds > CERTAIN and self._take(found)
+            # a reference that comes after its echo is rare: two windows must show it
+            fresh = found is not None and not found.old and found.lag >= 0 and found.odds > CERTAIN
+            return found is not None and fresh and self._take(found)
         elif found := self._found:
             first, ref = self._used[0], self._expected or self._ref
             return self._lags.before(first, self._mics[first], ref, found) and self._take(found)
