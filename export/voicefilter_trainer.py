@@ -27,7 +27,8 @@ HELD_OUT_S = 8.0
 def loss(network: nn.Module, batch: Mapping[str, Tensor], half: bool = False) -> tuple[Tensor, Tensor]:
     """Difference of power-law compressed magnitudes, and the estimate's spectrum (batch, frames, bins, 2), scaled as the batch is."""
     magnitude = batch["mic"].norm(dim=-1)
-    with torch.autocast("cpu", torch.bfloat16, enabled=half):
+    # a processor without AVX-512 has no such LSTM
+    with torch.autocast("cpu", torch.bfloat16, enabled=half and torch.ops.mkldnn._is_mkldnn_bf16_supported()):
         mask = network(magnitude, batch["d_vector"])
     difference = power_law_loss(mask.float(), magnitude, batch["clean"].norm(dim=-1), COMPRESSION)
     return difference, mask.float().unsqueeze(-1) * batch["mic"]
