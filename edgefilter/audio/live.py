@@ -75,15 +75,18 @@ class LiveSource(Source):
     def stats(self) -> dict[str, int]:
         """Samples at 16 kHz that were lost, filled or moved; callbacks marked as overrun; devices lost and found again.
 
-        lost: samples of the recording that lack one or both; what both devices lost, as in a machine that slept, is lost once.
-        An overrun may hide an unknown number of samples.
+        lost: samples of the recording that lack one or both. Each is counted once: what both devices lost, as in a machine
+        that slept, and reference that never came, which is filled or inserted as silence. An overrun may hide an unknown
+        number of samples.
         """
         counts = {f"reference_{name}": getattr(self._pairing, name) for name in ("filled", "dropped", "inserted")}
+        replaced = {"microphone": 0, "reference": self._pairing.filled + self._pairing.inserted}
         times: dict[str, int] = {}
         for name, each in (("microphone", self._mic), ("reference", self._reference)):
-            counts |= {f"{name}_lost": each.lost if each else 0, f"{name}_away": each.filled if each else 0}
+            counts[f"{name}_lost"] = each.lost + max(each.missed - replaced[name], 0) if each else 0
+            counts[f"{name}_away"] = each.filled if each else 0
             times |= {f"{name}_{what}": getattr(each, what, 0) for what in ("overruns", "gone", "back")}
-        missing = [sum(counts[key] for key in counts if key.startswith(name)) for name in ("microphone", "reference")]
+        missing = [sum(counts[key] for key in counts if key.startswith(name)) for name in replaced]
         return {"lost": max(missing), **counts, **times}
 
     def __iter__(self) -> Iterator[Block]:

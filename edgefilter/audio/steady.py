@@ -17,6 +17,8 @@ from edgefilter.types import SAMPLE_RATE, Samples
 
 RETRY_S = 1.0
 """Between two attempts to open a device that is away."""
+LOOK_S = 3 * BUFFER_S
+"""How long sound may be late before it counts as lost: a pairing that can replace it needs up to two of its windows."""
 
 
 class SteadyInput:
@@ -31,8 +33,8 @@ class SteadyInput:
         self._make, self._patience_s = make, patience_s
         self.port = make()
         self.filled = self.gone = self.back = 0
-        self._earlier_lost = self._earlier_overruns = 0
-        self._open, self._clock = False, SampleClock(BUFFER_S)
+        self._earlier_lost = self._earlier_missed = self._earlier_overruns = 0
+        self._open, self._clock = False, SampleClock(LOOK_S)
         self._failure: DeviceError | None = None
         self._latest = np.zeros(0, np.float32)
         self._received_at = self._gone_at = self._tried_at = 0.0
@@ -54,9 +56,13 @@ class SteadyInput:
 
     @property
     def lost(self) -> int:
-        """Samples at 16 kHz that did not fit into the ring or never came."""
-        seconds = self._clock.missed + self.port.inlet.lost / self.port.rate
-        return self._earlier_lost + round(seconds * SAMPLE_RATE)
+        """Samples at 16 kHz that did not fit into the ring: silence stands in."""
+        return self._earlier_lost + round(self.port.inlet.lost / self.port.rate * SAMPLE_RATE)
+
+    @property
+    def missed(self) -> int:
+        """Samples at 16 kHz that never came: nothing stands in."""
+        return self._earlier_missed + round(self._clock.missed * SAMPLE_RATE)
 
     @property
     def overruns(self) -> int:
@@ -110,9 +116,10 @@ class SteadyInput:
             if port:
                 port.close()
             return
+        self._earlier_missed = self.missed
         if port is not self.port:
             self._earlier_lost, self._earlier_overruns = self.lost, self.overruns
-        self.port, self._clock, self._open = port, SampleClock(BUFFER_S), True
+        self.port, self._clock, self._open = port, SampleClock(LOOK_S), True
 
 
 class SteadySink(Sink):

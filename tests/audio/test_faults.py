@@ -94,6 +94,21 @@ def test_a_reference_that_stutters_stays_in_step_and_every_gap_is_counted(both):
     assert stats["reference_gone"] == 0 and sum(block.mic.size for block in blocks) == 26 * 16000
 
 
+@pytest.mark.parametrize("swallowed", [0.15, 0.5])
+def test_reference_that_a_driver_loses_is_lost_once_in_counters_and_events(both, tmp_path, swallowed):
+    system, _, ref = both
+    system.at(6.0, lambda: setattr(ref, "swallows", swallowed))
+    source, told = LiveSource("mic", "ref"), []
+    with source, FileSink(tmp_path / "x.wav") as out:
+        troubles, heard = Troubles(source, out), []
+        for block in limited(source, 14 * 16000):
+            heard.append(block.ref)
+            told += [event.detail for event in troubles(block.start + block.mic.size, False)]
+    silent = int(np.count_nonzero(np.concatenate(heard) == 0.0))
+    assert source.stats()["lost"] == silent >= swallowed * 16000
+    assert sum(int(part.split()[0]) for detail in told for part in detail.split(", ")) == silent
+
+
 def test_sound_that_a_driver_loses_without_a_word_is_counted(both):
     system, mic, ref = both
     system.at(6.0, lambda: [setattr(each, "swallows", 0.5) for each in (mic, ref)])
