@@ -16,7 +16,7 @@ from edgefilter.dsp.frames import decibels
 from edgefilter.errors import EdgefilterError
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.filter.timing import peak_memory_mb
-from edgefilter.types import SAMPLE_RATE, SET_UP_WRONG, Block, Event, Samples, Stats
+from edgefilter.types import SAMPLE_RATE, SET_UP_WRONG, Block, Event, EventKind, Samples, Stats
 
 SILENT_DB = float(decibels(0.0))
 """Level of digital silence, dB of full scale."""
@@ -80,7 +80,8 @@ class Verdict:
 
     removed_db: by how much the robot alone was lowered, None where it was not found; lag_ms: of its voice behind the reference,
     negative where the reference came later, None where it is not known.
-    noticed: how often a human was, None where the engine does not judge it. wrong: what was set up wrongly, a sentence each.
+    noticed: how often a human was, None where the engine does not judge it. wrong: what was set up wrongly, a sentence each,
+    of each kind of event the latest.
     """
 
     removed_db: float | None
@@ -89,18 +90,16 @@ class Verdict:
     wrong: tuple[str, ...]
 
     @classmethod
-    def of(cls, progress: Progress, stats: Stats, events: Iterable[Event], judges: bool) -> Verdict:
-        """The verdict on a run that has ended."""
-        kept, alignment = list(events), stats["alignment"] or {}
+    def of(cls, progress: Progress, stats: Stats, noticed: int | None, wrong: list[str]) -> Verdict:
+        """The verdict on a run that has ended; wrong: what its events said."""
+        alignment = stats["alignment"] or {}
         lag, found = alignment.get("delay_samples"), alignment.get("state") == "coarse"
-        wrong = [event.detail for event in kept if event.kind in SET_UP_WRONG]
         if not wrong and alignment and lag is None and not found and progress.robot_s >= UNFOUND_S:
             wrong = [
                 f"the reference carries {progress.robot_s:.0f} s of sound, and nothing of it is found in the microphone: is it from"
                 " another recording, or was the loudspeaker muted, or were headphones used?"
             ]
         lag_ms = None if lag is None else 1000 * lag / SAMPLE_RATE
-        noticed = sum(event.kind == "speech_started" for event in kept) if judges else None
         heard = not alignment or lag is not None or found
         return cls(progress.lowered_db if heard else None, lag_ms, noticed, tuple(wrong))
 
@@ -165,7 +164,8 @@ def filter_blocks(
     show: called after each block. tell: called with each event of the filter, and of source and sink by troubles(sample, last).
     due: whether somebody waits for the sound; for a recording no hop is too late, and no event says that it is.
     """
-    report, progress = RunReport(), Progress()
+    report, progress, noticed = RunReport(), Progress(), 0
+    wrong: dict[EventKind, str] = {}
     began = time.perf_counter()
 
     def push(out: Samples) -> None:
@@ -175,9 +175,13 @@ def filter_blocks(
             recorder.write_output(out)
 
     def tell_events(last: bool) -> None:
+        nonlocal noticed
         happened = [event for event in ego.events() if due or event.kind != "overloaded"]
         for event in [*happened, *troubles(report.samples_in, last)]:
             tell(event)
+            noticed += event.kind == "speech_started"
+            if event.kind in SET_UP_WRONG:
+                wrong[event.kind] = event.detail
             report.events.append(replace(event, turn=None))
 
     try:
@@ -207,5 +211,5 @@ def filter_blocks(
     report.wall_s = time.perf_counter() - began
     stats = ego.stats()
     report.filter = dict(stats)
-    report.verdict = Verdict.of(progress, stats, report.events, ego.judges_speech)
+    report.verdict = Verdict.of(progress, stats, noticed if ego.judges_speech else None, [*wrong.values()])
     return report

@@ -60,3 +60,20 @@ def test_the_report_of_a_run_keeps_what_happened_without_its_sound():
     )
     assert told == [spoken] and told[0].turn is spoken.turn
     assert list(report.events) == [spoken] and report.events[0].turn is None
+
+
+def test_a_verdict_counts_what_the_report_no_longer_keeps():
+    """Only the latest thousand events were looked at: of a long run the first minutes were forgotten."""
+    block = Block(np.zeros(160, np.float32), np.zeros(160, np.float32), 0)
+    said = [Event("reference_late", 0, "it is late"), *[Event("speech_started", 0, "")] * 1500]
+
+    class Nowhere:
+        def write(self, out: np.ndarray) -> None: ...
+
+    class Judge(EgoFilter):
+        judges_speech = True
+
+    report = filter_blocks(
+        [block], Judge(engine="bypass"), Nowhere(), troubles=lambda sample, last: [] if last else said
+    )
+    assert report.verdict and (report.verdict.noticed, report.verdict.wrong) == (1500, ("it is late",))

@@ -38,8 +38,7 @@ FILE_ENDINGS = (
 
 
 def main(args: argparse.Namespace) -> int:
-    if not is_device(args.output) and args.output != "-" and not Path(args.output).is_fifo():
-        form_of(Path(args.output))
+    check_output(args.output)
     speech = make_speech(args)
     file = args.learn if args.learn and Path(args.learn).exists() else args.profile
     profile = Profile.load(file) if file else None
@@ -80,6 +79,18 @@ def main(args: argparse.Namespace) -> int:
     missed = f", {report.filter['deadline']['missed_deadlines']} deadlines missed" if source.live else ""
     _say_end(args, report, missed)
     return 130 if report.interrupted and not source.live else 0
+
+
+def check_output(name: str) -> None:
+    """Raise UsageError where name is no pipe and neither a file that can be written nor, if it has a dot in it, a device."""
+    if not is_device(name):
+        if name != "-" and not Path(name).is_fifo():
+            form_of(Path(name))
+    elif Path(name).suffix:
+        try:
+            find(name, "output")
+        except EdgefilterError as error:
+            raise UsageError(f"output {name} is no file, which ends in .wav or .flac, and no device: {error}") from None
 
 
 def make_speech(args: argparse.Namespace) -> SpokenReference | None:

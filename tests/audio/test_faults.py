@@ -14,7 +14,7 @@ from edgefilter.audio.protocols import Troubles
 from edgefilter.audio.sample_clock import SampleClock
 from edgefilter.audio.steady import SteadySink
 from edgefilter.cli import main
-from edgefilter.commands.run import limited
+from edgefilter.commands.run import check_output, limited
 from edgefilter.errors import DeviceError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.session import filter_blocks
@@ -195,6 +195,13 @@ def test_an_output_device_that_is_unplugged_comes_back_and_what_was_not_played_i
     # every sample was played, dropped for a full queue, or found no device; what the device held when it went is unknown
     assert played + stats["dropped"] + stats["output_away"] == pytest.approx(20 * 16000, abs=0.5 * 16000)
     assert played == pytest.approx(12 * 16000, abs=1.5 * 16000)
+
+
+def test_an_output_device_is_named_by_a_part_with_a_dot_and_what_is_no_device_is_no_file(plug):
+    plug(VirtualDevice("mic", "input"), VirtualDevice("alsa_output.usb-4", "output"))
+    check_output("output.usb")
+    with pytest.raises(UsageError, match="out.xyz is no file, which ends in .wav or .flac, and no device: output dev"):
+        check_output("out.xyz")
 
 
 def test_a_device_that_was_never_there_is_an_error_and_not_waited_for(plug, tmp_path):

@@ -203,10 +203,14 @@ def test_output_over_an_input_is_refused(speech):
 
 @pytest.mark.parametrize(
     ("output", "words"),
-    [("out.m4a", ["ends in '.m4a'", ".wav or .flac"]), ("there", ["is a folder", "there/human.wav"])],
+    [
+        ("out.m4a", ["ends in '.m4a'", ".wav or .flac"]),
+        ("out.xyz", ["out.xyz is no file", ".wav or .flac", "no device"]),
+        ("there", ["is a folder", "there/human.wav"]),
+    ],
 )
 def test_an_output_that_cannot_be_written_is_refused_before_anything_is_looked_at(speech, output, words, monkeypatch):
-    """The first was looked for among the sound devices, the second was said to end in ''."""
+    """The first two were looked for among the sound devices, the third was said to end in ''."""
     (speech / "there").mkdir()
     monkeypatch.chdir(speech)
     one_line(here("run", "--input", "missing.wav", "--engine", "bypass", "--output", output), 2, *words)
