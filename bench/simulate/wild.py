@@ -9,7 +9,7 @@ than LEAST_DB over the fan. Robot, room and tolerances are those of hidden_robot
 for figures, never for tuning: no two halves share a suite.
 
 Debian: sox ffmpeg swh-plugins tap-plugins cmt caps invada-studio-plugins-ladspa zam-plugins vlevel lame opus-tools speex
-libgsm-tools fil-plugins rev-plugins guitarix-ladspa blop vorbis-tools. PyPI: pedalboard noisereduce webrtc-noise-gain.
+libgsm-tools fil-plugins rev-plugins guitarix-ladspa blop vorbis-tools dpf-plugins-ladspa. PyPI: pedalboard noisereduce webrtc-noise-gain.
 """
 
 from __future__ import annotations
@@ -235,6 +235,17 @@ def _compressor(r: Rng) -> Command:
     return pedalboard("Compressor", **level, attack_ms=log_uniform(r, 1, 20), release_ms=log_uniform(r, 60, 500))
 
 
+def _clipped_microphone(r: Rng) -> Command:
+    """A microphone that clips at a share of the peak that it hears."""
+    share = r.uniform(0.25, 0.5)
+
+    def run(x: Array) -> Array:
+        most = share * np.abs(x).max()
+        return _filtered(x, f"aeval='clip(val(0),-{most:.5f},{most:.5f})'")
+
+    return Command(f"ffmpeg -af aeval=clip at {share:.2f} of the peak", run)
+
+
 # fmt: off
 TUNING: tuple[Program, ...] = (
     Program("sox bass, treble", "source", ("equaliser",),
@@ -386,9 +397,55 @@ UNSEEN: tuple[Program, ...] = (
             lambda r: coded(f"ffmpeg -y -i {{wav}} -c:a aac -b:a {r.integers(12, 32)}k -f adts {{packed}}", "ffmpeg -y -i {packed} {out}")),
 )
 """zam, fil, guitarix, zita, blop, Vorbis, SBC, AAC: nothing was chosen on them."""
+UNTRIED: tuple[Program, ...] = (
+    Program("sox equalizer", "source", ("equaliser",),
+            lambda r: sox("equalizer", f"{log_uniform(r, 300, 4000):.0f}", f"{r.uniform(0.5, 2):.2f}q", f"{either(r, 5, 10):.1f}")),
+    Program("ffmpeg superequalizer", "source", ("equaliser",), lambda r: ffmpeg("superequalizer=" + ":".join(
+        f"{band}b={10 ** (db / 20):.3f}" for band, db in enumerate(np.interp(np.arange(13), np.arange(0, 15, 3), gains(r, 5)), 3)))),
+    Program("ffmpeg atilt", "source", ("equaliser",),
+            lambda r: ffmpeg(f"atilt=freq={r.uniform(800, 2500):.0f}:slope={either(r, 0.2, 0.6):.2f}:width=3000:order=5")),
+    Program("dpf 3BandEQ", "source", ("equaliser",), lambda r: ladspa(
+        "3BandEQ-ladspa", "3BandEQ", *gains(r, 3), 0, r.uniform(200, 600), r.uniform(1500, 4000), channels=2)),
+    Program("sox band", "source", ("bandlimit", "equaliser"), lambda r: sox("band", f"{r.uniform(800, 1600):.0f}", f"{r.uniform(1500, 3000):.0f}")),
+    Program("ffmpeg lowpass", "source", ("bandlimit", "equaliser"), lambda r: ffmpeg(f"lowpass=f={r.uniform(1500, 3500):.0f}:p=2")),
+    Program("sox echos", "room", ("early_path",), lambda r: sox("echos", 1.0, 1.0, *(
+        word for ms in echoes_ms(r, 2) for word in (ms, round(float(r.uniform(0.15, 0.4)), 2))))),
+    Program("ffmpeg adelay, amix", "room", ("early_path",), lambda r: ffmpeg(
+        f"asplit[a][b];[b]adelay={r.uniform(2, 9):.0f},volume={either(r, 0.2, 0.5):.2f}[c];[a][c]amix=normalize=0")),
+    Program("dpf MVerb", "room", ("late_reverb",), lambda r: ladspa(
+        "MVerb-ladspa", "MVerb", r.uniform(20, 70), 80, 60, 0, r.uniform(10, 25), r.uniform(30, 60), r.uniform(20, 60), 100,
+        r.uniform(20, 60), channels=2)),
+    Program("dpf MaFreeverb", "room", ("late_reverb",), lambda r: ladspa(
+        "MaFreeverb-ladspa", "MaFreeverb", r.uniform(0.1, 0.3), 0.7, r.uniform(0.3, 0.7), 0.4, channels=2)),
+    Program("dpf SoulForce", "source", ("speaker_nonlinearity", "playback_gain"),
+            lambda r: ladspa("SoulForce-ladspa", "SoulForce", r.uniform(0.5, 0.9), 0, 0, 1, channels=2)),
+    Program("ffmpeg aeval, one side bent", "source", ("speaker_nonlinearity",),
+            lambda r: ffmpeg(f"aeval='val(0)-{r.uniform(0.2, 0.8):.2f}*val(0)*val(0)'")),
+    Program("sox contrast", "source", ("speaker_nonlinearity", "playback_gain"), lambda r: sox("contrast", f"{r.uniform(20, 90):.0f}")),
+    Program("ffmpeg aeval, clipped", "source", ("speaker_nonlinearity", "limiter"),
+            lambda r: ffmpeg(f"aeval='clip(val(0),-{r.uniform(0.08, 0.25):.3f},{r.uniform(0.08, 0.25):.3f})'")),
+    Program("ffmpeg aeval behind the microphone", "microphone", ("mic_clipping",), _clipped_microphone),
+    Program("ffmpeg compand", "source", ("compression",), lambda r: ffmpeg(
+        f"compand=attacks={log_uniform(r, 0.003, 0.03):.3f}:decays={log_uniform(r, 0.08, 0.5):.2f}:"
+        f"points=-90/-90|{(knee := r.uniform(-45, -30)):.0f}/{knee:.0f}|0/{knee * (1 - 1 / r.uniform(2, 6)):.0f}")),
+    Program("ffmpeg sidechaincompress by itself", "source", ("compression",), lambda r: ffmpeg(
+        f"asplit[a][b];[a][b]sidechaincompress=threshold={10 ** (r.uniform(-34, -22) / 20):.3f}:ratio={r.uniform(2.5, 8):.1f}:"
+        f"attack={log_uniform(r, 2, 30):.1f}:release={log_uniform(r, 60, 500):.0f}")),
+    Program("ffmpeg agate", "source", ("unknown",), lambda r: ffmpeg(
+        f"agate=threshold={10 ** (r.uniform(-20, -12) / 20):.3f}:ratio={r.uniform(2, 6):.1f}:attack=5:release={log_uniform(r, 50, 300):.0f}")),
+    Program("ffmpeg speechnorm", "microphone", ("mic_agc",), lambda r: ffmpeg(f"speechnorm=e={r.uniform(3, 8):.1f}:r=0.0005:f=0.002")),
+    Program("ffmpeg afreqshift", "source", ("unknown",), lambda r: ffmpeg(f"afreqshift=shift={either(r, 0.1, 2):.2f}")),
+    Program("ffmpeg apulsator", "source", ("unknown",), lambda r: ffmpeg(
+        f"pan=stereo|c0=c0|c1=c0,apulsator=hz={r.uniform(0.7, 6):.1f}:amount={r.uniform(0.3, 0.8):.2f}:offset_r=0,pan=mono|c0=c0")),
+    Program("sox chorus", "source", ("unknown",), lambda r: sox(
+        "chorus", 1, 1, f"{r.uniform(20, 40):.0f}", f"{r.uniform(0.2, 0.5):.2f}", f"{r.uniform(0.2, 1):.1f}", f"{r.uniform(0.5, 2):.1f}", "-s")),
+    Program("mp2", "source", ("codec",),
+            lambda r: coded(f"ffmpeg -y -i {{wav}} -c:a mp2 -b:a {r.choice([16, 24, 32])}k -f mp2 {{packed}}", "ffmpeg -y -f mp3 -i {packed} {out}")),
+)
+"""Programs of DPF and further ones of SoX and ffmpeg: not run before a change of the diagnosis is done (--seed 6157 --count 30)."""
 # fmt: on
 
-HALVES = {"tuning": TUNING, "reporting": REPORTING, "unseen": UNSEEN}
+HALVES = {"tuning": TUNING, "reporting": REPORTING, "unseen": UNSEEN, "untried": UNTRIED}
 CONTROL = Program("none", "source", ("none",), None)
 
 
