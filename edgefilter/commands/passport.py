@@ -26,8 +26,7 @@ def main(args: argparse.Namespace) -> None:
     with progress("passport") as step:
         human = voice[speaking(voice)]
         found = measure(recording, reference, human, args.human_db, args.engine or ENGINES, step)
-        wanted = found.found and not args.no_diagnosis
-        named, verdict = _diagnosed(recording, reference, step) if wanted else (None, "not asked for")
+        named, verdict = (None, "not asked for") if args.no_diagnosis else _diagnosed(recording, reference, step)
     figures = found.to_dict() | {
         "diagnosis": named.to_dict() if named else None,
         "said": {**expectation(found), "diagnosis": verdict},

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from contextlib import suppress
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -13,7 +14,7 @@ from edgefilter.alignment.coarse_lag import CoarseLag
 from edgefilter.calibration.from_recording import STANDS_OUT, fan_in_silences, find_drift, find_lag, silences
 from edgefilter.calibration.multisine import PERIOD
 from edgefilter.diagnosis.compare import rounded
-from edgefilter.diagnosis.prepare import FRAME, HOP
+from edgefilter.diagnosis.prepare import FRAME, HOP, leads
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.fractional_delay import delayed, interpolate
 from edgefilter.dsp.frames import block_power, blocks, decibels, frames
@@ -88,7 +89,7 @@ class Expected:
 
 @dataclass(frozen=True)
 class Passport:
-    """All that one recording tells; levels in dB of full scale. Where the reference is not found, the rest is empty.
+    """All that one recording tells; levels in dB of full scale.
 
     lag_ms, lag_spread_ms: median of the windows with a sharp arrival, and the span of their middle eight tenths; sharp:
     the share of windows that have one; without any the lag is coarse, to a hop of 16 ms. drift_ppm: parts of a million by
@@ -106,19 +107,18 @@ class Passport:
     clipped: float
     gated: float
     human_db: float
-    found: bool
-    pauses: bool = False
-    lag_ms: float | None = None
-    lag_spread_ms: float | None = None
-    sharp: float = 0.0
-    drift_ppm: float | None = None
-    removable_db: float = 0.0
-    over_noise_db: float = 0.0
-    change_db: float = 0.0
-    follows: float = 0.0
-    cause: Cause = "nothing"
-    bands: tuple[Band, ...] = ()
-    engines: dict[str, Expected] = field(default_factory=dict)
+    pauses: bool
+    lag_ms: float
+    lag_spread_ms: float | None
+    sharp: float
+    drift_ppm: float | None
+    removable_db: float
+    over_noise_db: float
+    change_db: float
+    follows: float
+    cause: Cause
+    bands: tuple[Band, ...]
+    engines: dict[str, Expected]
 
     def to_dict(self) -> dict[str, Any]:
         """Ready for JSON, schema 1."""
@@ -138,7 +138,7 @@ def measure(
     mic, ref: (n,), (m,), what the microphone heard and what the robot said, 16 kHz, full scale +-1; the first MOST_S are
     taken. voice: (v,), a human without pauses at the ends, laid on at human_db of the microphone's power in the same
     seconds. engines: which are tried, without a profile and without learning. Raises SignalError where there are fewer
-    than LEAST_S, or the reference or the microphone is silent.
+    than LEAST_S, the reference or the microphone is silent, or the reference is not found in the recording or after its echo.
 
     Notes
     -----
@@ -153,21 +153,16 @@ def measure(
     >>> said = rng.standard_normal(192_000).astype(np.float32) * (0.05 + 0.05 * np.sin(np.arange(192_000) / 900))
     >>> heard = 0.5 * np.roll(said, 800) + 1e-4 * rng.standard_normal(192_000)
     >>> found = measure(heard.astype(np.float32), said.astype(np.float32), said[:32_000], engines=["linear"])
-    >>> found.found, round(found.lag_ms), found.removable_db > 20
-    (True, 50, True)
+    >>> round(found.lag_ms), found.removable_db > 20
+    (50, True)
     """
     most = round(MOST_S * SAMPLE_RATE)
     mic, ref = paired(mic[:most], ref[:most])
     _check(mic, ref)
     known = _levels(mic, ref) | {"human_db": human_db}
     progress("lag and drift")
-    lag = _lag(mic, ref)
-    if lag is None:
-        quietest = np.sort(block_power(mic, SAMPLE_RATE // 10))
-        noise_db = float(decibels(quietest[: quietest.size // 20].mean()))
-        return Passport(**known, noise_db=noise_db, found=False)
+    lag, lags = _lag(mic, ref)
     near, ppm = delayed(ref, lag), None
-    lags = _lags(mic, near)
     if lags.size:
         ppm, behind = find_drift(mic, near)
         near = delayed(ref, lag + behind)
@@ -191,7 +186,6 @@ def measure(
         **known,
         noise_db=float(decibels(total_power(fan))),
         pauses=pauses_s > 0.0,
-        found=True,
         lag_ms=(lag + (float(np.median(lags)) if lags.size else 0.0)) / SAMPLE_RATE * 1000,
         lag_spread_ms=spread,
         sharp=lags.size / int(mic.size / (WINDOW_S * SAMPLE_RATE)),
@@ -251,15 +245,31 @@ def _levels(mic: Samples, ref: Samples) -> dict[str, Any]:
     return told | {"gated": float(np.mean((shut < GATED) & (played > 0.0)))}
 
 
-def _lag(mic: Samples, ref: Samples) -> int | None:
-    """Samples: that of the sharpest arrival, without one the coarse lag, None where there is neither."""
-    try:
-        return find_lag(mic, ref)
-    except SignalError:
+def _lag(mic: Samples, ref: Samples) -> tuple[int, Array]:
+    """Samples: the lag of the sharpest arrival, and those of `_lags` from it; without one the coarse lag, and none.
+
+    The sharpest arrival of the whole is chance where no window has one near it: of 55 pairs of unrelated real recordings seven
+    have such an arrival, and none of their windows has; of 21 true pairs a third of the windows or more. Raises SignalError where the
+    reference is not found, or is later than the recording.
+    """
+    lag: int | None = None
+    lags = np.zeros(0)
+    with suppress(SignalError):
+        lag = find_lag(mic, ref)
+        lags = _lags(mic, delayed(ref, lag))
+    if not lags.size:
         coarse = CoarseLag(HOP, 2 * SAMPLE_RATE)
         for part in zip(blocks(mic, HOP), blocks(ref, HOP)):
             coarse.step(*part)
-        return coarse.find()
+        lag = coarse.find()
+    if lag is None:
+        raise SignalError(
+            "the recording does not contain the reference at any lag: is it of another recording, or was the loudspeaker"
+            " muted? ('edgefilter doctor' finds wrong connections)"
+        )
+    if early := leads(lag):
+        raise SignalError(early)
+    return lag, lags
 
 
 def _lags(mic: Samples, near: Samples) -> Array:

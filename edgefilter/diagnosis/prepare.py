@@ -142,17 +142,22 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
         warnings += (
             f"the reference is cut in mid-word: only {begin / SAMPLE_RATE:.1f} to {end / SAMPLE_RATE:.1f} s are evaluated",
         )
-    if (lead_ms := -1000.0 * (profile.delay + offset) / SAMPLE_RATE) > LEADS_MS:
-        warnings += (
-            f"the recording has the robot {lead_ms:.0f} ms before the reference: are the two swapped, or did the recording of"
-            " the reference begin later?",
-        )
+    if early := leads(profile.delay + offset):
+        warnings += (early,)
     if len(pieces) > 1:
         lags = ", ".join(f"{lag:.1f} from {first / SAMPLE_RATE:.1f} s" for first, _, lag in pieces)
         warnings += (f"the utterances lag by different numbers of samples: {lags}; aligned one by one",)
     measurement = Measurement(x, y, psd, fitted_blocks(n) & usable, calibrated)
     ordinary = ordinary_distortion(profile, predicted)
     return Prepared(measurement, model, predicted, usable, active, offset, human, warnings, ordinary)
+
+
+def leads(lag: float) -> str:
+    """What to ask where the recording lags by so many samples, below zero, behind the reference; nothing where it may."""
+    if (lead_ms := -1000.0 * lag / SAMPLE_RATE) <= LEADS_MS:
+        return ""
+    asked = "are the two swapped, or did the recording of the reference begin later?"
+    return f"the recording has the robot {lead_ms:.0f} ms before the reference: {asked}"
 
 
 def ordinary_distortion(profile: Profile, predicted: Samples) -> tuple[tuple[Samples, Array], ...]:

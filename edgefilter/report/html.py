@@ -85,7 +85,7 @@ def passport_page(found: Passport, diagnosis: str, names: Mapping[str, Any]) -> 
     series = ["linear, by coherence", *found.engines]
     heights = [[band.removable_db, *band.removed_db.values()] for band in found.bands]
     top = 10.0 * math.ceil(max([20.0, *(db for group in heights for db in group)]) / 10.0)
-    wide = 676 / max(len(found.bands), 1)
+    wide = 676 / len(found.bands)
     bars = [
         (kind, round(40 + wide * (at + 0.1 + 0.8 * kind / len(series)), 1), round(200 - 190 * db / top, 1),
          round(0.8 * wide / len(series) - 1, 1), round(190 * db / top, 1))

@@ -36,8 +36,6 @@ FIRST = {
 
 def headline(found: Passport) -> str:
     """The most important in a sentence."""
-    if not found.found:
-        return "The reference is not found in the recording."
     if not found.engines:
         return "The reference is found."
     best = max(found.engines, key=lambda name: found.engines[name].si_sdr_db)
@@ -48,7 +46,7 @@ def expectation(found: Passport) -> dict[str, object]:
     """What was found, how uncertain the prediction is, and what to change first, for JSON."""
     return {
         "headline": headline(found),
-        "cause": sentence(CAUSES[found.cause]) if found.found else "",
+        "cause": sentence(CAUSES[found.cause]),
         "changes": advice(found),
         "uncertainty_db": {"median": ERROR_DB[0], "worst": ERROR_DB[1]},
     }
@@ -56,11 +54,6 @@ def expectation(found: Passport) -> dict[str, object]:
 
 def advice(found: Passport) -> list[str]:
     """What to change, the most important first."""
-    if not found.found:
-        return [
-            "Check that the recording holds the robot, and that the reference is what was played, not earlier than 3 s before;"
-            " `edgefilter doctor` finds wrong connections."
-        ]
     told = [FIRST[found.cause]] if found.cause in FIRST else []
     if not found.pauses:
         told += ["let the robot pause for some seconds while it is recorded: the noise is not known, and may be less"]
@@ -81,16 +74,12 @@ def advice(found: Passport) -> list[str]:
 def rows(found: Passport) -> list[tuple[str, str, str]]:
     """Name, value and what it means, of everything that is one number."""
     noise = f"{found.noise_db:.0f} dBFS" if found.noise_db > -119.0 else "none"
-    told = [
+    spread = "no arrival is sharp" if found.lag_spread_ms is None else f"moves by {found.lag_spread_ms:.1f} ms"
+    drift = "-" if found.drift_ppm is None else f"{found.drift_ppm:+.0f} ppm"
+    return [
         ("microphone", f"{found.mic_db:.0f} dBFS", f"peak {found.mic_peak_db:.0f} dBFS"),
         ("reference", f"{found.ref_db:.0f} dBFS", f"peak {found.ref_peak_db:.0f} dBFS"),
         ("noise", noise, "in the robot's pauses" if found.pauses else "at most: in the quietest moments"),
-    ]
-    if not found.found:
-        return told
-    spread = "no arrival is sharp" if found.lag_spread_ms is None else f"moves by {found.lag_spread_ms:.1f} ms"
-    drift = "-" if found.drift_ppm is None else f"{found.drift_ppm:+.0f} ppm"
-    told += [
         ("lag", f"{found.lag_ms:.0f} ms", f"{spread}; sharp in {100 * found.sharp:.0f} % of the windows"),
         ("drift", drift, "positive: the lag shrinks"),
         ("linear", f"{found.removable_db:.1f} dB", "what a fixed linear filter can take off, by coherence"),
@@ -99,23 +88,21 @@ def rows(found: Passport) -> list[tuple[str, str, str]]:
         ("follows", f"{found.follows:.2f}", "correlation of band levels with the reference's"),
         ("gated", f"{100 * found.gated:.0f} %", "of the time the microphone is digitally silent while the robot plays"),
     ]
-    return told
 
 
 def lines(found: Passport, diagnosis: str) -> list[str]:
     """For the terminal."""
     told = [headline(found), ""]
     told += [f"{name:<12}{value:<10}{what}" for name, value, what in rows(found)]
-    if found.found:
-        told += [f"{'':<12}{sentence(CAUSES[found.cause])}", ""]
-        heads = ("linear", "noise", "follows", *found.engines)
-        told.append(f"{'band, Hz':<12}" + "".join(f"{head:>10}" for head in heads))
-        for band in found.bands:
-            row = f"{f'{band.low:.0f}-{band.high:.0f}':<12}{band.removable_db:>10.1f}{band.over_noise_db:>10.1f}"
-            engines = "".join(f"{band.removed_db[name]:>10.1f}" for name in found.engines)
-            told.append(f"{row}{band.follows:>10.2f}{engines}")
-        told += ["", *(f"{name:<12}{what}" for name, what in engine_lines(found)), f"{'':<12}{uncertainty(found)}"]
-        told += ["", f"{'diagnosis':<12}{diagnosis}"]
+    told += [f"{'':<12}{sentence(CAUSES[found.cause])}", ""]
+    heads = ("linear", "noise", "follows", *found.engines)
+    told.append(f"{'band, Hz':<12}" + "".join(f"{head:>10}" for head in heads))
+    for band in found.bands:
+        row = f"{f'{band.low:.0f}-{band.high:.0f}':<12}{band.removable_db:>10.1f}{band.over_noise_db:>10.1f}"
+        engines = "".join(f"{band.removed_db[name]:>10.1f}" for name in found.engines)
+        told.append(f"{row}{band.follows:>10.2f}{engines}")
+    told += ["", *(f"{name:<12}{what}" for name, what in engine_lines(found)), f"{'':<12}{uncertainty(found)}"]
+    told += ["", f"{'diagnosis':<12}{diagnosis}"]
     return [*told, "change first:", *(f"  {at}. {line}" for at, line in enumerate(advice(found), start=1))]
 
 
