@@ -253,7 +253,7 @@ def _lag(mic: Samples, ref: Samples) -> tuple[int, Array]:
     reference is not found, or is later than the recording.
     """
     lag: int | None = None
-    lags = np.zeros(0)
+    lags: Array = np.zeros(0)
     with suppress(SignalError):
         lag = find_lag(mic, ref)
         lags = _lags(mic, delayed(ref, lag))
