@@ -10,6 +10,7 @@ import hmac
 import http
 import json
 import logging
+import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -38,8 +39,11 @@ PART_S = 0.02
 """Sound that is filtered before other clients have their turn: what a message usually holds."""
 AHEAD_S, BEHIND_S, TURNS = 0.1, 2.0, 10
 """Sound that may come before its time, five messages, or after it, what networks hold up, and is filtered at once. What is
-ahead of that waits, one client after the other, so many turns of the event loop a part: in five a message of 20 ms, which is
-due, goes all its way."""
+ahead of that waits, one client after the other, until nothing else has been done for so many turns of the event loop: in five a
+message of 20 ms goes all its way."""
+SHARE = 0.5
+"""Of a core's time, what a stream may take at once: whose messages cost more than their sound lasts is ahead of its time as
+one is that sends too much of it. `crnn` takes 0.1 to 0.3."""
 PATIENCE_S, IDLE_S = 5.0, 60.0
 """Timeouts, s: for the handshake, the first message and the reading of an answer each; and for every later message."""
 READ_AT_ONCE, MOST_FRAMES = 4096, 1000
@@ -57,14 +61,15 @@ Answer = bytes | str
 class Session:
     """One client's stream: its messages in, what is to be sent to it out; no network.
 
-    form: its first message. ego: its own. ended: whether its last answer was given.
+    form: its first message. ego: its own. ended: whether its last answer was given. can_wait: whether what is left of the work
+    of the latest message is ahead of its time, or was when it came.
     """
 
     def __init__(self, form: Form, ego: EgoFilter) -> None:
         self.form, self.ego = form, ego
-        rate = form.rate
+        rate, self._now = form.rate, asyncio.get_running_loop().time
         self._to_filter = Resampler(rate, SAMPLE_RATE, form.microphones), Resampler(rate, SAMPLE_RATE)
-        self._pace = Pace(asyncio.get_running_loop().time) if form.streams == "stereo" else None
+        self._pace = Pace(self._now)
         self._encode: Callable[[Samples, bool], list[bytes]]
         decoders: tuple[Decode, Decode] = partial(_microphones_of, count=form.microphones), from_pcm16
         if form.codec == "opus":
@@ -77,11 +82,11 @@ class Session:
             from_filter = Resampler(SAMPLE_RATE, rate)
             self._encode = lambda human, last: [as_pcm16(from_filter.push(human, last))]
             codec_s = from_filter.delay_s
-        late = round(form.late_ms * rate / 1000)
+        late, self._part = round(form.late_ms * rate / 1000), round(PART_S * rate)
         self._two = TwoStreams(*decoders, rate, late) if form.streams == "two" else None
         self.delay_ms = 1000 * (ego.latency / SAMPLE_RATE + self._to_filter[0].delay_s + codec_s)
-        self._announced = self._announcing = self.ended = False
-        self._due = asyncio.get_running_loop().time()
+        self._announced = self.can_wait = self.ended = False
+        self._due, self._sound_s = self._now(), 0.0
         self._counted = self._counts()
 
     def ready(self, learns: bool) -> str:
@@ -89,13 +94,16 @@ class Session:
         told = {"rate": self.form.rate, "codec": self.form.codec, "engine": self.ego.engine_name}
         return _text("ready", **told, delay_ms=round(self.delay_ms, 1), late_ms=self.form.late_ms, learn=learns)
 
-    @property
-    def can_wait(self) -> bool:
-        """Whether the next part of the work is ahead of its time: more sound came than a microphone records."""
-        return self._announcing or self._due > asyncio.get_running_loop().time() + AHEAD_S
+    def charge(self, spent_s: float) -> None:
+        """Count the time of the processor that a part has taken; more work, or sound, than is due can wait from then on."""
+        now = self._now()
+        self._due = max(self._due, now - BEHIND_S) + max(self._sound_s, spent_s / SHARE)
+        self._sound_s = 0.0
+        self.can_wait |= self._due > now + AHEAD_S
 
     def take(self, message: bytes | str) -> Iterator[list[Answer]]:
         """Take a message; what is to be answered, part by part. Raises SignalError for one that is none."""
+        self.can_wait = self._due > self._now() + AHEAD_S
         if isinstance(message, str):
             kind = message_of(message).get("kind")
             if kind == "end":
@@ -104,17 +112,14 @@ class Session:
                 raise SignalError(f"found a message of kind {kind!r}, expected 'announce' or 'end'")
             self._announced = kind == "announce"
         elif self._announced:
-            self._announced, self._announcing = False, True
-            yield from self._announce(from_pcm16(message))
-            self._announcing = False
+            self._announced, self.can_wait = False, True
+            yield from self._announce(message)
         else:
             if self._two:
                 self._two.push(message)
-                mic, ref = self._two.take()
+                yield from self._filter(*self._two.take())
             else:
-                both = of_pcm16(message, self.form.microphones + 1)
-                mic, ref = taken(both, range(self.form.microphones)), np.ascontiguousarray(both[:, -1])
-            yield from self._filter(mic, ref)
+                yield from self._stereo(message)
 
     def finish(self) -> Iterator[list[Answer]]:
         """The filter's last samples and the closing message with the statistics; nothing once they have been returned."""
@@ -129,22 +134,27 @@ class Session:
         self.ended = True
         yield [_text("ended", **figures, **self._counts(), deadline=stats["deadline"])]
 
-    def _announce(self, utterance: Samples) -> Iterator[list[Answer]]:
+    def _announce(self, utterance: bytes) -> Iterator[list[Answer]]:
         whole, parts = Resampler(self.form.rate, SAMPLE_RATE), []
-        size = self.form.rate // 4
-        for at in range(0, len(utterance), size):
+        for pcm in _cut(utterance, self.form.rate // 4, 1):
             yield []
-            parts.append(whole.push(utterance[at : at + size]))
-        parts.append(whole.push(utterance[:0], last=True))
+            parts.append(whole.push(from_pcm16(pcm)))
+        parts.append(whole.push(np.zeros(0, np.float32), last=True))
         self.ego.announce(np.concatenate(parts))
 
-    def _filter(self, mic: Samples, ref: Samples) -> Iterator[list[Answer]]:
-        if self._pace and (wrong := self._pace.note(len(mic), self.form.rate)):
+    def _stereo(self, message: bytes) -> Iterator[list[Answer]]:
+        channels = self.form.microphones + 1
+        came = len(message) // (2 * channels)
+        if wrong := self._pace.note(came, self.form.rate):
             yield [self._told(Event("rate_mismatch", self.ego.stats()["samples"], wrong))]
-        size = round(PART_S * self.form.rate)
-        for at in range(0, len(mic), size):
-            part = slice(at, min(at + size, len(mic)))
-            self._due = max(self._due, asyncio.get_running_loop().time() - BEHIND_S) + (part.stop - at) / self.form.rate
+        for pcm in _cut(message, self._part, channels):
+            both = of_pcm16(pcm, channels)
+            yield from self._filter(taken(both, range(channels - 1)), np.ascontiguousarray(both[:, -1]))
+
+    def _filter(self, mic: Samples, ref: Samples) -> Iterator[list[Answer]]:
+        for at in range(0, len(mic), self._part):
+            part = slice(at, min(at + self._part, len(mic)))
+            self._sound_s = (part.stop - at) / self.form.rate
             yield self._filter_part(mic[part], ref[part], last=False)
 
     def _filter_part(self, mic: Samples, ref: Samples, last: bool) -> list[Answer]:
@@ -190,7 +200,7 @@ class Service:
     ) -> None:
         self._make, self._streams, self._learners, self._token = make_filter, streams, learners, token
         self._serving = self._learning = 0
-        self._making, self._backlog = asyncio.Lock(), asyncio.Lock()
+        self._making, self._backlog, self._done = asyncio.Lock(), asyncio.Lock(), 0
         self._guests: dict[ServerConnection, None] = {}
         self._conversing: set[asyncio.Task[None]] = set()
         self._stopping = asyncio.Event()
@@ -304,21 +314,28 @@ class Service:
     async def _work(
         self, connection: ServerConnection, session: Session, work: Iterator[list[Answer]], answers: deque[Answer]
     ) -> None:
-        """Do a client's work part by part, and others' in between: first the work of those whose sound is due."""
+        """Do a client's work part by part, and others' in between."""
         await self._send(connection, answers)
-        while True:
-            if session.can_wait:
-                async with self._backlog:
-                    for _ in range(TURNS):
-                        await asyncio.sleep(0)
-                    more = next(work, None)
-            else:
-                await asyncio.sleep(0)
-                more = next(work, None)
-            if more is None:
-                return
-            answers.extend(more)
+        more: list[Answer] | None = []
+        while more is not None:
+            await self._turn(session)
+            began = time.thread_time()
+            more = next(work, None)
+            session.charge(time.thread_time() - began)
+            answers.extend(more or ())
             await self._send(connection, answers)
+
+    async def _turn(self, session: Session) -> None:
+        """Wait for the next turn of the event loop; where the session can wait, for its turn among such, when all others rest."""
+        await asyncio.sleep(0)
+        if session.can_wait:
+            async with self._backlog:
+                quiet = 0
+                while quiet < TURNS:
+                    done = self._done
+                    await asyncio.sleep(0)
+                    quiet = quiet + 1 if done == self._done else 0
+        self._done += 1
 
     async def _send(self, connection: ServerConnection, answers: deque[Answer]) -> None:
         """Send them in their order; a client that does not read them in time is let go."""
@@ -390,6 +407,14 @@ def _refuse(connection: ServerConnection, why: str) -> None:
 def _let_go(connection: ServerConnection) -> None:
     _LOGGER.warning("client %s reads too slowly; its connection is closed", connection.remote_address)
     connection.transport.abort()
+
+
+def _cut(pcm: bytes, size: int, channels: int) -> Iterator[memoryview]:
+    """16-bit samples, interleaved, in parts of so many: of 4 MB the conversion alone would hold up others for long."""
+    whole = len(pcm) - len(pcm) % (2 * channels)
+    for at in range(0, whole, 2 * channels * size):
+        yield memoryview(pcm)[at : min(at + 2 * channels * size, whole)]
+    of_pcm16(memoryview(pcm)[whole:], channels)
 
 
 def _microphones_of(pcm: bytes, count: int) -> Samples:
