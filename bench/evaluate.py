@@ -19,7 +19,7 @@ import numpy as np
 from scipy.stats import rankdata
 
 from bench import metrics, recordings, results, runner, systems
-from bench.metrics import QUANTITIES, difference, mean, middle, pooled
+from bench.metrics import QUANTITIES, SECOND, difference, mean, middle, pooled
 from bench.recordings import Cells, Clip
 from bench.systems import System
 from edgefilter.errors import EdgefilterError, UsageError
@@ -39,6 +39,8 @@ FEW = 8
 """With fewer clips nothing is said of a conclusion."""
 NORMED = {systems.BATCH_NORM: "paper-crnn-narrow"}
 """A network with batch normalisation, and the row that it is compared with."""
+COUNTED = ("insertions", "deletions")
+"""Of the words, over all words."""
 WORST = 10
 """Clips that the page names, and lets hear with --html."""
 NOTES = """Mean [95 % interval], drawn over speakers and rooms, not over utterances. WER: word errors over the span in which
@@ -82,11 +84,13 @@ def run(options: argparse.Namespace) -> str:
     clips = find_clips(options)
     here, absent = systems.present(systems.chosen(options.systems, dict(options.network)))
     data = {"recordings": options.folders} | ({"HUMAN": [options.speech]} if options.speech else {})
-    models = {"WHISPER": options.whisper} | {one.name: one.model for one in here if one.model}
+    models = {"WHISPER": options.whisper, "SECOND": options.second_whisper}
+    models |= {one.name: one.model for one in here if one.model}
     made_with = results.stamp(data, [one.name for one in here], models)
-    setup = runner.Setup(options.cache, options.whisper, tuple(options.network))
+    setup = runner.Setup(options.cache, options.whisper, tuple(options.network), options.second_whisper)
     rows = runner.run(clips, here, setup, options.jobs, options.scheduler)
-    tables = [headline(rows), glance(rows, here), *groups(rows, here, options.against), *slices(rows, here)]
+    tables = [headline(rows), glance(rows, here), *groups(rows, here, options.against)]
+    tables += [*recognisers(rows, here, options.against), *slices(rows, here)]
     tables += [worst_table(worst(rows, here), rows), results.absent(absent)]
     notes = "\n\n".join([NOTES, "What the source paper (Li, Hindriks & Kunneman 2024) concluded:", conclusions(rows)])
     parts = {"clips": results.columns(about(clips, rows)), "rows": results.columns(slim(rows))}
@@ -190,7 +194,7 @@ def glance(rows: Sequence[dict], here: Sequence[System]) -> dict:
 def groups(rows: Sequence[dict], here: Sequence[System], against: Sequence[str]) -> list[dict]:
     found = []
     for (name, room), own in grouped(rows).items():
-        other = next((one for one in against if any(row.get("si_sdr") is not None for row in of(own, one))), "")
+        other = compared_with(own, against)
         columns = ["system", "knows", ("WER %", 0), ("uncapped", 0), ("median", 0), ("pooled", 0), ("put in", 0),
                    ("left out", 0), ("SI-SDR dB", 1), ("median", 1), ("ESTOI", 2), ("ERLE dB", 1), ("echo MOS", 1),
                    ("human MOS", 1), ("compute s", 2), "latency ms", (f"WER less {other}", 0), (f"dB less {other}", 1)]  # fmt: skip
@@ -201,6 +205,34 @@ def groups(rows: Sequence[dict], here: Sequence[System], against: Sequence[str])
     return found
 
 
+def compared_with(rows: Sequence[dict], against: Sequence[str]) -> str:
+    """The first of these systems that ran on clips with a human, "" without one."""
+    return next((one for one in against if any(row.get("si_sdr") is not None for row in of(rows, one))), "")
+
+
+def recognisers(rows: Sequence[dict], here: Sequence[System], against: Sequence[str]) -> list[dict]:
+    """What both recognisers understand, a row for each set, room and system; no table without a second one."""
+    cells, kinds = [], ("", SECOND)
+    for (name, room), own in grouped(rows).items():
+        other = compared_with(own, against)
+        for one in here:
+            mine = of(own, one.name)
+            if mean(mine, f"{SECOND}capped"):
+                wrong = [mean(mine, f"{kind}capped") for kind in kinds]
+                shares = [middle(pooled(mine, f"{kind}{key}", f"{kind}words")) for kind in kinds for key in COUNTED]
+                less = [
+                    None if one.name == other else difference(mine, of(own, other), f"{kind}capped") for kind in kinds
+                ]
+                cells.append(
+                    [f"{name}, {room}", one.title, wrong[0], *shares[:2], less[0], wrong[1], *shares[2:], less[1]]
+                )
+    columns = [(head, 0) for kind in ("", "second: ") for head in
+               (f"{kind}WER %", f"{kind}put in", f"{kind}left out", f"{kind}WER less")]  # fmt: skip
+    text = f"'less': than {' or '.join(against)}, the first that ran, on the same clips."
+    title = "Two recognisers"
+    return [results.table("recognisers", title, ["set, room", "system", *columns], cells, text)] if cells else []
+
+
 def _cells(one: System, own: Sequence[dict], other: Sequence[dict]) -> list | None:
     ran = [row for row in own if "absent" not in row]
     if not ran:
@@ -209,7 +241,7 @@ def _cells(one: System, own: Sequence[dict], other: Sequence[dict]) -> list | No
     title = one.title + (f" ({unusable} outputs unusable)" if unusable else "")
     wer, ratio = mean(ran, "wer"), mean(ran, "si_sdr")
     words = [mean(ran, "capped"), middle(wer), wer and wer["median"], pooled(ran, "errors", "words")]
-    words += [middle(pooled(ran, key, "words")) for key in ("insertions", "deletions")]
+    words += [middle(pooled(ran, key, "words")) for key in COUNTED]
     plain = [middle(mean(ran, key)) for key in ("estoi", "erle_db", "echo_mos", "human_mos")]
     timed = [row for row in ran if "seconds" in row and "duration" in row]
     compute = 5 * sum(row["seconds"] for row in timed) / sum(row["duration"] for row in timed) if timed else None
@@ -403,5 +435,5 @@ def about(clips: Sequence[Clip], rows: Sequence[dict]) -> list[dict]:
 
 def slim(rows: Sequence[dict]) -> list[dict]:
     """The figures without what `about` says of the clip, and without transcripts, which stay in the cache."""
-    left_out = ("set", "room", "speaker", "place", "facts", "transcript", "text")
+    left_out = ("set", "room", "speaker", "place", "facts", "transcript", f"{SECOND}transcript", "text")
     return [{key: value for key, value in row.items() if key not in left_out} for row in rows]

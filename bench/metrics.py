@@ -29,6 +29,8 @@ ALONE_S = 5.0
 tell what of a nonlinear filter's output is echo."""
 MOS_S = 20.0
 """AECMOS gets at most so much, up to the human's end: it was trained on clips of about 10 s."""
+SECOND = "second_"
+"""Before the name of a figure: of the second recogniser."""
 TALK_TYPES = {"doubletalk": "dt", "farend": "st", "nearend": "nst"}
 """AECMOS's names for who talks."""
 
@@ -42,14 +44,23 @@ class CachedMetrics:
 
     cache: Cache
     recogniser: Recogniser | None = None
+    second: Recogniser | None = None
 
-    def words(self, text: str, out: Samples) -> dict | None:
-        """Return errors, words, deletions, insertions, capped (%) and the transcript; None without a recogniser."""
-        if self.recogniser is None:
-            return None
-        said = self.recogniser.transcribe(out)
-        found = word_errors(text, said)
-        return asdict(found) | {"wer": 100 * found.rate, "capped": 100 * found.capped, "transcript": said}
+    @property
+    def asked(self) -> str:
+        """Which recognisers the words are of."""
+        return " ".join(one.identity for one in (self.recogniser, self.second) if one) or "no recogniser"
+
+    def words(self, text: str, out: Samples) -> dict:
+        """Return errors, words, deletions, insertions, wer, capped (%) and transcript; the second recogniser's as second_errors and so on."""
+        row = {}
+        for before, one in (("", self.recogniser), (SECOND, self.second)):
+            if one:
+                said = one.transcribe(out)
+                found = word_errors(text, said)
+                told = asdict(found) | {"wer": 100 * found.rate, "capped": 100 * found.capped, "transcript": said}
+                row |= {f"{before}{key}": value for key, value in told.items()}
+        return row
 
     def mos(self, mic: Samples, ref: Samples, out: Samples, talk: str) -> dict[str, float]:
         """Return echo_mos and human_mos, 1 to 5 (Purin et al. 2022, "AECMOS"); empty where speechmos is not installed."""
@@ -123,7 +134,7 @@ def score(clip: Clip, output: Output, cached: CachedMetrics) -> dict:
     if not np.array_equal(out[span], human):  # the human alone has no distance from itself
         row |= {"si_sdr": si_sdr(out[span], human), "estoi": cached.estoi(human, out[span])}
     if clip.text:
-        row |= cached.words(clip.text, out[span]) or {}
+        row |= cached.words(clip.text, out[span])
     return row if output.events is None else row | noticed(output.events, first_sound(clip.human))
 
 

@@ -1,7 +1,7 @@
 """Word errors by a recogniser on this machine; nothing is fetched.
 
-Whisper-base (faster-whisper, int8, one thread): a folder with a CTranslate2 conversion, model.bin, config.json,
-tokenizer.json, vocabulary.json. Transcripts are kept under the sound's hash, so that none is recognised twice.
+Whisper (faster-whisper, int8, one thread): a folder with a CTranslate2 conversion, model.bin, config.json,
+tokenizer.json, vocabulary.json or .txt. Transcripts are kept under the sound's hash, so that none is recognised twice.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ class Recogniser:
     def __init__(self, folder: Path, cache: Cache) -> None:
         model, config = folder / "model.bin", folder / "config.json"
         if not model.is_file() or not config.is_file():
-            wanted = "expected a CTranslate2 conversion of Whisper-base"
+            wanted = "expected a CTranslate2 conversion of Whisper"
             raise UsageError(f"{folder} holds no model.bin and config.json; {wanted}")
         self.identity = f"{model.stat().st_size} {config.read_text()} {SETTINGS} {PEAK}"
         self._folder, self._cache = folder, cache

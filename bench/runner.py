@@ -25,11 +25,12 @@ SCORING = ("speechmos", "pystoi", "jiwer", "faster-whisper", "ctranslate2")
 
 @dataclass(frozen=True)
 class Setup:
-    """What every worker is told once: where scores are kept, the recogniser's folder, further networks by name."""
+    """What every worker is told once: where scores are kept, the recognisers' folders, further networks by name."""
 
     cache: Path | None
     whisper: Path | None = None
     networks: tuple[tuple[str, Path], ...] = ()
+    second_whisper: Path | None = None
 
 
 def run(
@@ -53,18 +54,27 @@ def run(
 
 def cached_metrics(setup: Setup) -> CachedMetrics:
     kept = Cache(setup.cache, "by_sound")
-    return CachedMetrics(kept, Recogniser(setup.whisper, kept) if setup.whisper else None)
+    folders = setup.whisper, setup.second_whisper
+    return CachedMetrics(kept, *(Recogniser(folder, kept) if folder else None for folder in folders))
 
 
 def _work(setup: Setup, task: tuple[Clip, tuple[str, ...]]) -> tuple[str, list[dict]]:
     (clip, names), (known, kept, cached) = task, _opened(setup)
-    asked = cached.recogniser.identity if cached.recogniser else "no recogniser"
     about = {"set": clip.set, "room": clip.room, "clip": clip.name, "speaker": clip.speaker, "place": clip.place}
     about |= {"text": clip.text, "facts": kept.get(lambda: facts(clip), "facts", clip.fingerprint, _scoring())}
     rows = []
     for name in names:
         system = known[name]
-        key = (clip.fingerprint, clip.talk, str(clip.text), str(clip.voices), name, _code(system), _scoring(), asked)
+        key = (
+            clip.fingerprint,
+            clip.talk,
+            str(clip.text),
+            str(clip.voices),
+            name,
+            _code(system),
+            _scoring(),
+            cached.asked,
+        )
         rows.append({**about, "system": name, **kept.get(lambda system=system: one(clip, system, cached), *key)})
     return clip.name, rows
 

