@@ -174,11 +174,11 @@ class EgoService:
             return AsyncClient.from_uri(self._microphone)
         form, (program, *words) = self.mic_format, shlex.split(self._microphone)
         samples = self.duplex.ego.hop * form.rate // SAMPLE_RATE
-        return MicProcessAsyncClient(form.rate, 2, form.channels, samples, program, words)
+        return _Command(form.rate, 2, form.channels, samples, program, words)
 
     async def _hear(self, chunk: AudioChunk) -> None:
-        at_s = None if chunk.timestamp is None else chunk.timestamp / 1000
-        human = await asyncio.to_thread(self.duplex.hear_pcm16, chunk.audio, chunk.rate, chunk.channels, 1, at_s)
+        # senders stamp chunks with when they read them, some in nanoseconds: that tells no more than when they came
+        human = await asyncio.to_thread(self.duplex.hear_pcm16, chunk.audio, chunk.rate, chunk.channels, 1)
         if human:
             self._tell(AudioChunk(chunk.rate, 2, 1, human, chunk.timestamp).event())
         while self._events:
@@ -195,6 +195,17 @@ class EgoService:
     def _tell(self, message: Message) -> None:
         for listener in self.listeners:
             listener.send(message)
+
+
+class _Command(MicProcessAsyncClient):
+    """The microphone's command."""
+
+    async def disconnect(self) -> None:
+        process, self._proc = self._proc, None
+        assert process is not None
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+        await process.communicate()  # wait() alone would wait for ever for the end of a pipe that is full
 
 
 class _BoundedReader:

@@ -137,6 +137,7 @@ def test_commands_are_microphone_and_loudspeaker_and_who_hangs_up_interrupts(end
             await speaker.write_event(AudioStop().event())
             assert Played.is_type((await speaker.read_event()).type)
             await asyncio.sleep(0.1)
+            assert service.duplex.stats()["unheard_s"] == 0.0  # the stamps, nanoseconds, were taken for lost sound
             played = service.duplex.stats()["played_s"]
             for _ in range(20):
                 await speaker.write_event(noise())
@@ -334,12 +335,14 @@ def test_a_microphones_command_is_mono_unless_it_says_otherwise(capsys):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stop", [signal.SIGTERM, signal.SIGINT], ids=["sigterm", "ctrl-c"])
-def test_one_signal_ends_it_with_its_commands(endless_noise, player, stop):
+@pytest.mark.parametrize("floods", [False, True], ids=["in real time", "floods"])
+def test_one_signal_ends_it_with_its_commands(endless_noise, player, floods, stop):
+    """A pipe that was full kept it waiting for its end."""
     ports = free_port(2)
     mic_uri, snd_uri = (f"tcp://127.0.0.1:{ports + i}" for i in range(2))
     words = [
         "--microphone",
-        endless_noise,
+        "cat /dev/zero" if floods else endless_noise,
         "--mic-command-channels",
         "2",
         "--mic-channels",
