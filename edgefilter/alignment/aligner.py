@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from edgefilter.alignment.coarse_lag import CoarseLag
-from edgefilter.alignment.delay_line import HALF_WIDTH, Aligned, Tape, kernel_table, read_delayed, read_line
+from edgefilter.alignment.delay_line import HALF_WIDTH, WAIT, Aligned, Tape, kernel_table, read_delayed, read_line
 from edgefilter.alignment.delay_tracker import DRIFTED, FAINT, SIZE, STRIDE, DelayMeasurement, DelayMeter, DriftFilter
 from edgefilter.alignment.lag_search import CERTAIN, MINIMUM, REFLECTIONS, SEEN_ODDS, Found, LagSearch
 from edgefilter.alignment.utterances import AHEAD, Announcements, FirstSounds, OnsetDetector, Playback, Utterance
@@ -84,7 +84,7 @@ class Aligner:
         self._announced = Announcements()
         self._expected: Playback | None = None
         self._found: Found | None = None
-        self._read_at = float("nan")
+        self._read_at, self._wait = float("nan"), 0
         self._to_search, self._to_measure, self._stage, self._far = SEARCH_STRIDE, STRIDE // 2, 0, False
         self._gain: float | None = None
         self._by_bands = None if self._calibrated else CoarseLag(self.hop, self._max_lag)
@@ -243,7 +243,7 @@ class Aligner:
             if found is not None and found.old and found.odds * SEEN_ODDS > CERTAIN:
                 self._found, self._stage = found, 3
             # a reference that comes after its echo is rare: two windows must show it
-            fresh = found is not None and not found.old and found.lag >= 0 and found.odds > CERTAIN
+            fresh = found is not None and not found.old and found.lag >= -WAIT and found.odds > CERTAIN
             return found is not None and fresh and self._take(found)
         elif found := self._found:
             first, ref = self._used[0], self._expected or self._ref
@@ -361,8 +361,10 @@ class Aligner:
         if not (self._known or self._coarse):
             nothing = self.history(self.hop)
             anywhere = self._at_any_lag(mic, nothing, state)
-            return Aligned(nothing, float("nan"), 0.0, 0.0, state, switched, anywhere)
-        self._read_at = max(self._drift.delay - self._margin, 0.0)
+            return Aligned(nothing, float("nan"), 0.0, 0.0, state, switched, anywhere, self._wait)
+        if self._drift.delay < HALF_WIDTH or self._drift.delay > PRE_ROLL:  # in between either will do
+            self._wait = WAIT if self._drift.delay < HALF_WIDTH else 0
+        self._read_at = max(self._drift.delay + self._wait - self._margin, 0.0)
         end = self._ref.end
         start = self._read_at - self._drift.slope * self.hop if switched else before
         if self._read_at < HALF_WIDTH:
@@ -376,7 +378,7 @@ class Aligner:
             reference = np.zeros(self.hop, np.float32)
         ppm = -1e6 * self._drift.slope
         anywhere = self._at_any_lag(mic, reference, state)
-        return Aligned(reference, self._drift.delay, ppm, self._probability, state, switched, anywhere)
+        return Aligned(reference, self._drift.delay, ppm, self._probability, state, switched, anywhere, self._wait)
 
     def _at_any_lag(self, mic: Samples, reference: Samples, state: AlignmentState) -> bool:
         """What `Aligned` says of it, for a hop of the microphone and the reference at the delay of before.

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import fft
 
-from edgefilter.alignment.delay_line import Tape
+from edgefilter.alignment.delay_line import WAIT, Tape
 from edgefilter.alignment.utterances import Playback
 from edgefilter.dsp.frames import rise
 from edgefilter.dsp.lag import LOWEST_HZ, flattened
@@ -34,7 +34,7 @@ SEEN, SEEN_ODDS = 5.0, 20.0
 lags have 10 there, chance 3.3."""
 EVEN, STEEP, EARLY_ODDS = 1.37, 9.9, 0.05
 """Clearness of a lag that is as likely right as not, the power of it that the odds grow with, and what is left of the odds where the
-reference would come after its echo. Fitted to 12 minutes of robots in measured rooms, beside noise and humans up to 5 dB louder,
+reference would come more than WAIT after its echo. Fitted to 12 minutes of robots in measured rooms, beside noise and humans up to 5 dB louder,
 and as many of other speech while the robot is not heard."""
 CERTAIN = 100.0
 """Odds from which on a lag is believed: while a human and an unheard robot talk all the time, a wrong one in an hour."""
@@ -62,7 +62,7 @@ class Found:
     @property
     def odds(self) -> float:
         """That the robot arrives there, over that it does not, where it is as likely not to be heard at all."""
-        return (self.clearness / EVEN) ** STEEP * (EARLY_ODDS if self.lag < 0 else 1.0)
+        return (self.clearness / EVEN) ** STEEP * (EARLY_ODDS if self.lag < -WAIT else 1.0)
 
 
 class LagSearch:

@@ -61,7 +61,7 @@ class StftConfig:
     @cached_property
     def synthesis_window(self) -> Samples:
         """The synthesis window, canonical dual of the analysis window, (window_length,) float32."""
-        return (self._window64 / self._coverage[np.arange(self.window_length) % self.hop]).astype(np.float32)
+        return (self._window64 / self._coverage).astype(np.float32)
 
     @cached_property
     def _window64(self) -> Array:
@@ -70,12 +70,25 @@ class StftConfig:
         window = hann(self.window_length)
         return np.sqrt(window) if self.window == "root-hann" else window
 
+    def waiting_window(self, wait: int) -> Samples:
+        """Analysis window for a frame whose last `wait` samples are not there yet, (window_length,) float32: zero there.
+
+        The other frames that touch these samples weigh them so that synthesis still gives the identity.
+        """
+        window = self._window64.copy()
+        window[window.size - wait :] = 0.0
+        return (window / np.maximum(self._over_frames(window * self.synthesis_window), 1e-3)).astype(np.float32)
+
     @property
     def _coverage(self) -> Array:
-        """Sum of the squared window over all frames that touch a sample, by position in the hop, (hop,)."""
+        """Sum of the squared window over all frames that touch a sample, (window_length,)."""
+        return self._over_frames(self._window64**2)
+
+    def _over_frames(self, weight: Array) -> Array:
+        """Sum of a frame's weights over all frames that touch a sample, (window_length,)."""
         padded = np.zeros(-(-self.window_length // self.hop) * self.hop)
-        padded[: self.window_length] = self._window64**2
-        return padded.reshape(-1, self.hop).sum(axis=0)
+        padded[: self.window_length] = weight
+        return np.resize(padded.reshape(-1, self.hop).sum(axis=0), self.window_length)
 
     def noise_gain(self) -> float:
         """Expected |spectrum|^2 of white noise of unit variance: the sum of the squared window."""
@@ -91,14 +104,22 @@ class Analyser:
         self._newest = list(self._recent[:, -config.hop :])
         self._padded = np.zeros((channels, config.n_fft), np.float32)
         self._windowed, self._window = self._padded[:, : config.window_length], config.analysis_window
+        self._wait = 0
 
-    def push(self, *hop_samples: Samples) -> Spectrum:
-        """Take the next hop (hop,) of each channel; return the frame that ends with it, (channels, bins) complex64."""
+    def push(self, *hop_samples: Samples, wait: int = 0) -> Spectrum:
+        """Take the next hop (hop,) of each channel; return the frame that ends with it, (channels, bins) complex64.
+
+        wait: samples by which the channels are late: so many at the frame's end are missing, and zero.
+        """
+        if wait != self._wait:
+            self._wait, self._window = wait, self.config.waiting_window(wait)
+            self._windowed[:, self.config.window_length - wait :] = 0.0
         recent, hop = self._recent, self.config.hop
         recent[:, :-hop] = recent[:, hop:]
         for newest, samples in zip(self._newest, hop_samples, strict=True):
             newest[:] = samples
-        np.multiply(recent, self._window, out=self._windowed)
+        there = self.config.window_length - wait
+        np.multiply(recent[:, wait:], self._window[:there], out=self._windowed[:, :there])
         return fourier.rfft(self._padded)
 
 

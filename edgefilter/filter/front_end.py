@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from edgefilter.alignment.aligner import Aligner
-from edgefilter.alignment.delay_line import UNLOCATED, Aligned
+from edgefilter.alignment.delay_line import UNLOCATED, WAIT, Aligned
 from edgefilter.alignment.paper import PaperAligner
 from edgefilter.dsp import fourier
 from edgefilter.dsp.stft import Analyser
@@ -154,6 +154,7 @@ class FrontEnd:
             self.cut = np.where(stft.frequencies < RUMBLE_HZ, np.float32(RUMBLE), np.float32(1.0))
         self._centred = Centred(stft.hop)
         self.heard = np.zeros(stft.hop, np.float32)
+        self._tail: Samples | None = None
         self._nothing = np.zeros(stft.bins, np.float32)
         self._noise = profile.noise_bins(stft) if profile else self._nothing
         self._silence = np.zeros(stft.bins, np.complex64)
@@ -173,6 +174,8 @@ class FrontEnd:
         if self.microphones:
             stage.canceller.tell_by(self.microphones.first)
         aligned = stage.aligner.step(heard, ref)
+        heard = self._waiting(heard, aligned.wait)
+        mic = self.first_of(heard)
         self.linear = linear = stage.step(heard, aligned)
         if aligned.state not in UNLOCATED:
             stage.removal.step(mic, aligned.reference, CancellerOutput(*map(self.first_of, linear)))
@@ -182,32 +185,38 @@ class FrontEnd:
             if self.microphones.step(heard, linear.error, ref, aligned.reference, located):
                 self.spatial.use(self.microphones.used)
                 stage.aligner.hear_by(np.flatnonzero(self.microphones.used).tolist())
-            r, (x, e, error) = self._combined(self.spatial, heard, aligned.reference, linear.echo)
+            r, (x, e, error) = self._combined(self.spatial, heard, aligned.reference, linear.echo, aligned.wait)
             uncertainty, fan = self.spatial.independent(linear.uncertainty), self.spatial.fan_psd()
             noise, residual = stage.residual.step(e, error, uncertainty, added, fan)
         else:
-            x, r, e, error = self._spectra(mic, aligned.reference, linear.echo, linear.error)
+            x, r, e, error = self._spectra(mic, aligned.reference, linear.echo, linear.error, wait=aligned.wait)
             noise, residual = stage.residual.step(e, error, linear.uncertainty, added)
         at_any_lag, self._before = aligned.at_any_lag or self._before, aligned.at_any_lag  # a frame is two hops
         return Frame(x, r, e, error, noise, residual, aligned.state == "idle", at_any_lag), aligned
+
+    def _waiting(self, mic: Samples, wait: int) -> Samples:
+        """The hop of mic (..., hop) that ends `wait` samples before the latest one, WAIT at most."""
+        before = np.zeros_like(mic[..., :WAIT]) if self._tail is None else self._tail
+        self._tail = mic[..., -WAIT:]
+        return np.concatenate((before[..., WAIT - wait :], mic[..., : mic.shape[-1] - wait]), axis=-1) if wait else mic
 
     def first_of(self, mic: Samples) -> Samples:
         """Of all (microphones, ...) that of the microphone that the answer sounds like (...,); of a single one as it is."""
         return mic if self.microphones is None else mic[self.microphones.first]
 
-    def _spectra(self, *signals: Samples) -> Spectrum:
-        """Spectra of k signals (hop,), (k, bins)."""
-        spectra = self._analyser.push(*signals)
+    def _spectra(self, *signals: Samples, wait: int) -> Spectrum:
+        """Spectra of k signals (hop,) that are `wait` samples late, (k, bins)."""
+        spectra = self._analyser.push(*signals, wait=wait)
         if self.cut is not None:
             spectra *= self.cut
         return spectra
 
     def _combined(
-        self, spatial: SpatialFilter, mic: Samples, reference: Samples, echo: Samples
+        self, spatial: SpatialFilter, mic: Samples, reference: Samples, echo: Samples, wait: int
     ) -> tuple[Spectrum, Spectrum]:
         """Spectra (bins,) of the reference, and (3, bins) of microphones, echo and error through the spatial filter."""
         count = len(mic)
-        spectra = self._spectra(reference, *mic, *echo)
+        spectra = self._spectra(reference, *mic, *echo, wait=wait)
         self.errors = spectra[1 : 1 + count] - spectra[1 + count :]
         x, error = spatial.step(np.stack((spectra[1 : 1 + count], self.errors)))
         return spectra[0], np.stack((x, x - error, error))

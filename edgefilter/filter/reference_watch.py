@@ -230,6 +230,7 @@ class ReferenceWatch:
     def _look(self, aligned: Aligned) -> list[tuple[EventKind, str]]:
         """One step of a search, where one is due, and what it leads to."""
         if aligned.state == "locked" and aligned.delay < -ARRIVES:
+            self._stage = 0  # a search that rests would compare what lies further apart than it looks
             return self._found_late(round(-aligned.delay))
         if aligned.state in ("locked", "coarse") and self.verdict != "fits":
             self._in_time += self._hop

@@ -26,6 +26,17 @@ def test_synthesis_undoes_analysis_for_every_config(config):
     assert np.abs(out[:lag]).max(initial=0) < 1e-6  # the silence before the start, same rounding
 
 
+@pytest.mark.parametrize("config", [config for config in GOOD if config.hop < config.window_length], ids=str)
+def test_synthesis_undoes_the_analysis_of_channels_that_are_late_without_any_delay(config):
+    wait = 32
+    x = np.random.default_rng(0).standard_normal(20 * config.hop).astype(np.float32)
+    late = np.concatenate((np.zeros(wait, np.float32), x))[: x.size]
+    analyser, synthesiser = Analyser(config), Synthesiser(config)
+    out = np.concatenate([synthesiser.push(analyser.push(hop, wait=wait)[0]) for hop in late.reshape(-1, config.hop)])
+    lag = config.window_length - config.hop
+    np.testing.assert_allclose(out[lag:], x[: x.size - lag], atol=2e-6 * np.abs(x).max())
+
+
 @pytest.mark.parametrize("config", GOOD, ids=str)
 def test_a_frame_is_the_fft_of_the_windowed_zero_padded_segment(config):
     x = np.random.default_rng(1).standard_normal(30 * config.hop).astype(np.float32)

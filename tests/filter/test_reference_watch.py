@@ -72,6 +72,29 @@ def test_a_sentence_said_again_while_its_first_echo_still_sounds_is_no_late_refe
     assert not {event.kind for event in found} & set(SET_UP_WRONG)
 
 
+@pytest.mark.parametrize("late", [0, 8, 30])
+def test_the_microphone_waits_for_a_reference_that_comes_up_to_two_milliseconds_late(robot, late):
+    mic, ref = (x[: 5 * RATE] for x in robot)
+    ego = EgoFilter(engine="linear")
+    out = np.append(ego.process(mic, later(ref, LAG + late)), ego.flush())
+    before, left = (float(np.mean(np.square(x[3 * RATE :]))) for x in (mic, out))
+    assert 10 * np.log10(before / left) > 24.0  # 27 dB where the reference is 4 ms early; without waiting 20, 5 and 2
+    assert not {event.kind for event in ego.events()} & set(SET_UP_WRONG)
+
+
+def test_a_search_that_rests_while_the_reference_is_late_is_given_up(robot):
+    watch, resting = ReferenceWatch(256, 257), 0
+    for at in range(0, 3 * RATE, 256):
+        mic, ref = (x[at : at + 256] for x in robot)
+        resting = resting or (at if watch._stage == 1 else 0)
+        late = resting and at < resting + RATE
+        aligned = Aligned(
+            np.zeros(256, np.float32), -60.0 if late else np.nan, 0.0, 0.0, "locked" if late else "begun", False
+        )
+        watch.step(mic, ref, aligned, Frame(*(np.zeros(257, np.float32),) * 6), Removal(256), False)
+    assert watch.verdict == "late"
+
+
 @pytest.mark.slow
 def test_a_late_reference_that_is_mended_is_forgotten(robot):
     mic, ref = robot
