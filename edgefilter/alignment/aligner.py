@@ -362,8 +362,8 @@ class Aligner:
             nothing = self.history(self.hop)
             anywhere = self._at_any_lag(mic, nothing, state)
             return Aligned(nothing, float("nan"), 0.0, 0.0, state, switched, anywhere, self._wait)
-        if self._drift.delay < HALF_WIDTH or self._drift.delay > PRE_ROLL:  # in between either will do
-            self._wait = WAIT if self._drift.delay < HALF_WIDTH else 0
+        if not HALF_WIDTH // 2 < self._drift.delay + self._wait < PRE_ROLL:
+            self._wait = min(max(HALF_WIDTH - round(self._drift.delay), 0), WAIT)
         self._read_at = max(self._drift.delay + self._wait - self._margin, 0.0)
         end = self._ref.end
         start = self._read_at - self._drift.slope * self.hop if switched else before

@@ -14,9 +14,9 @@ from edgefilter.types import AlignmentState, Array, Samples
 
 UNLOCATED: tuple[AlignmentState, ...] = ("begun", "announced")
 """States of the alignment in which the reference may lie elsewhere than the microphone hears it."""
-WAIT = 32
-"""Samples, 2 ms, that the microphone waits for a reference that comes after its echo: the end of the latest frame, which the
-synthesis window lowers by 14 dB and more, is left to the next one, so that the output comes no later."""
+WAIT = 224
+"""Samples, 14 ms, that the microphone waits at most for a reference that comes after its echo: the end of the latest frame is left to
+the next one, so that the output comes no later. Two frames must still share 2 ms."""
 
 
 class Aligned(NamedTuple):
@@ -32,7 +32,7 @@ class Aligned(NamedTuple):
     it was found, but the last looks did not see it, beside a loud human or after a jump; delay is carried on, with its
     drift. "locked": its delay is followed. at_any_lag: what is heard may be an utterance at a lag that nobody knows: it was
     not found so far, and no delay is known, or the one of before was refuted; of a calibrated robot, it is too loud for
-    anybody else (FirstSounds). wait: samples by which the microphone must be delayed to fit the reference, 0 or WAIT.
+    anybody else (FirstSounds). wait: samples by which the microphone must be delayed to fit the reference, WAIT at most.
     """
 
     reference: Samples

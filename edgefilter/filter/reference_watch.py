@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from edgefilter.alignment.aligner import COARSE_MARGIN
-from edgefilter.alignment.delay_line import Aligned, Tape
+from edgefilter.alignment.delay_line import WAIT, Aligned, Tape
 from edgefilter.alignment.lag_search import CERTAIN, WINDOW, LagSearch
 from edgefilter.alignment.utterances import FLOOR, NEVER, OnsetDetector
 from edgefilter.dsp import fourier
@@ -27,9 +27,9 @@ SEARCH_STRIDE = SAMPLE_RATE // 4
 """Samples of an utterance between two looks for it in what the microphone heard before."""
 IN_VAIN = 6
 """Looks, 1.5 s of speech, after which an utterance that is found nowhere is taken for one that is not heard."""
-ARRIVES, IN_TIME = 32, SAMPLE_RATE
-"""Samples, 2 ms, by which a reference must be late to count as late: devices that share a buffer are as exact; and of an echo
-that is followed behind the reference, after which that is not late, whatever a look has found."""
+AGREE, IN_TIME = 32, SAMPLE_RATE
+"""Samples within which two looks find the same lateness; and of an echo that is followed behind the reference, after which that is
+not late, whatever a look has found."""
 DOUBT = SAMPLE_RATE // 2
 """Samples for which speech that begins while the reference is silent waits for it, until it is known to come in time: an
 onset of the robot's is no human's if the reference follows."""
@@ -229,7 +229,7 @@ class ReferenceWatch:
 
     def _look(self, aligned: Aligned) -> list[tuple[EventKind, str]]:
         """One step of a search, where one is due, and what it leads to."""
-        if aligned.state == "locked" and aligned.delay < -ARRIVES:
+        if aligned.state == "locked" and aligned.delay < -WAIT:
             self._stage = 0  # a search that rests would compare what lies further apart than it looks
             return self._found_late(round(-aligned.delay))
         if aligned.state in ("locked", "coarse") and self.verdict != "fits":
@@ -252,12 +252,12 @@ class ReferenceWatch:
 
     def _decide(self, aligned: Aligned) -> list[tuple[EventKind, str]]:
         found = self._search.find()
-        if found is None or found.odds < CERTAIN or found.lag < ARRIVES or self._resembles_earlier(found.lag):
+        if found is None or found.odds < CERTAIN or found.lag < WAIT or self._resembles_earlier(found.lag):
             self._looks += 1
             if self._looks >= IN_VAIN and (self.verdict == "unknown" or aligned.state == "locked"):
                 self.verdict = "fits"
             return []
-        again = abs(found.lag - self._seen_at) <= ARRIVES
+        again = abs(found.lag - self._seen_at) <= AGREE
         self._seen_at, self._looks = found.lag, 0
         return self._found_late(found.lag) if again else []
 

@@ -72,13 +72,13 @@ def test_a_sentence_said_again_while_its_first_echo_still_sounds_is_no_late_refe
     assert not {event.kind for event in found} & set(SET_UP_WRONG)
 
 
-@pytest.mark.parametrize("late", [0, 8, 30])
-def test_the_microphone_waits_for_a_reference_that_comes_up_to_two_milliseconds_late(robot, late):
+@pytest.mark.parametrize("late", [0, 30, 128])
+def test_the_microphone_waits_for_a_reference_that_comes_some_milliseconds_late(robot, late):
     mic, ref = (x[: 5 * RATE] for x in robot)
     ego = EgoFilter(engine="linear")
     out = np.append(ego.process(mic, later(ref, LAG + late)), ego.flush())
     before, left = (float(np.mean(np.square(x[3 * RATE :]))) for x in (mic, out))
-    assert 10 * np.log10(before / left) > 24.0  # 27 dB where the reference is 4 ms early; without waiting 20, 5 and 2
+    assert 10 * np.log10(before / left) > 24.0  # 27 dB where the reference is 4 ms early; without waiting 20 and 2
     assert not {event.kind for event in ego.events()} & set(SET_UP_WRONG)
 
 
