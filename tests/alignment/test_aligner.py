@@ -228,7 +228,7 @@ def test_a_missed_look_or_another_suspicion_does_not_undo_a_jump_that_is_seen_ag
 def test_a_lag_is_the_likelier_the_clearer_it_is_and_the_less_so_where_the_reference_would_be_late():
     rising = [Found(2000, clearness).odds for clearness in (0.5, 1.0, 1.2, 1.37, 1.6, 2.1, 4.0)]
     assert rising == sorted(rising) and rising[0] < 0.001 and rising[3] == pytest.approx(1.0) and rising[-1] > 1000
-    assert Found(-20, 2.1).odds < 0.1 * Found(20, 2.1).odds
+    assert Found(-300, 2.1).odds < 0.1 * Found(20, 2.1).odds
 
 
 def test_no_step_of_a_search_comes_twice_in_a_hop(monkeypatch):

@@ -24,7 +24,9 @@ def told(ego: EgoFilter, mic: np.ndarray, ref: np.ndarray) -> dict:
     return {
         "out": levels_db(np.concatenate(out)),
         "probability": probability,
-        "events": [(one.kind, one.sample, one.detail) for one in ego.events()],
+        "events": [
+            (one.kind, one.sample, one.detail) for one in ego.events() if one.kind != "overloaded"
+        ],  # the machine's
         "stats": {name: stats[name] for name in UNTIMED},
     }
 
