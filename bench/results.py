@@ -260,9 +260,9 @@ def plain(value: Any) -> Any:
 def cell(value: Any, digits: int | None = None) -> str:
     """A cell of a table as text.
 
-    An interval without a width, of a single recording or of figures that are all alike, says nothing and is left out.
+    An interval that shows no width, of a single recording or of figures that are all alike, says nothing and is left out.
 
-    >>> cell({"mean": 31.2, "low": 25.04, "high": 37.1}, 0), cell({"mean": 9.2, "low": 9.2, "high": 9.2}, 1), cell(None)
+    >>> cell({"mean": 31.2, "low": 25.04, "high": 37.1}, 0), cell({"mean": 9.24, "low": 9.22, "high": 9.24}, 1), cell(None)
     ('31 [25, 37]', '9.2', '')
     """
     if value is None:
@@ -270,7 +270,7 @@ def cell(value: Any, digits: int | None = None) -> str:
     if isinstance(value, Mapping):
         mean = cell(value["mean"], digits)
         bounds = [cell(value.get(key), digits) for key in ("low", "high")]
-        return f"{mean} [{bounds[0]}, {bounds[1]}]" if all(bounds) and value["low"] != value["high"] else mean
+        return f"{mean} [{bounds[0]}, {bounds[1]}]" if all(bounds) and bounds[0] != bounds[1] else mean
     if isinstance(value, float) and digits is None:
         return f"{value:g}"
     return f"{value:.{digits}f}" if isinstance(value, (int, float)) and digits is not None else str(value)
