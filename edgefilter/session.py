@@ -182,7 +182,7 @@ def filter_blocks(
             noticed += event.kind == "speech_started"
             if event.kind in SET_UP_WRONG:
                 wrong[event.kind] = event.detail
-            report.events.append(replace(event, turn=None))
+            report.events.append(replace(event, turn=None, sound=None))
 
     try:
         for block in source:

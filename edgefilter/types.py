@@ -87,7 +87,7 @@ SET_UP_WRONG: tuple[EventKind, ...] = get_args(_SetUp)
 
 
 class Turn(NamedTuple):
-    """What the human said, from half a second before they were noticed until they had finished, 30 s at most.
+    """What the human said, from half a second before they were noticed until they had finished, 30 s at most; or a part of it.
 
     start: the first sample, of the microphone. samples: (n,) float32; of an array filtered once more with what is known
     at the end, with one microphone what was streamed.
@@ -121,12 +121,16 @@ class Event:
     turn : Turn, optional
         Of "speech_stopped": what the human said, for a recogniser that takes a turn as a whole; dropped after some time
         where nobody asks for the event.
+    sound : Turn, optional
+        Of "speech_started" and "speech_stopped": at least the last 300 ms before it at 16 kHz, without the robot, for a
+        classifier of turns or backchannels; at the start of a recording there is less.
     """
 
     kind: EventKind
     sample: int
     detail: str
     turn: Turn | None = field(default=None, compare=False, repr=False)
+    sound: Turn | None = field(default=None, compare=False, repr=False)
 
 
 AlignmentState: TypeAlias = Literal["idle", "announced", "begun", "unfound", "coarse", "lost", "locked"]

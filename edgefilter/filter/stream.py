@@ -209,15 +209,15 @@ class Stream:
                 except BaseException as error:  # the rest of the block is filtered first
                     self._raised = self._raised or error
 
-    def _tell(self, kind: EventKind, detail: str, turn: Turn | None = None) -> None:
-        self.events.append(Event(kind, self._stepped, detail, turn))
+    def _tell(self, kind: EventKind, detail: str, turn: Turn | None = None, sound: Turn | None = None) -> None:
+        self.events.append(Event(kind, self._stepped, detail, turn, sound))
 
     def _tell_of_speech(self, talk: EventKind, detail: str) -> None:
         if talk == "speech_started":
             self._turns.start(self.barge_in.waited)
-            self._tell(talk, detail)
+            self._tell(talk, detail, sound=self._turns.recent())
         else:
-            self._tell(talk, detail, Turn(*self._turns.finish()))
+            self._tell(talk, detail, self._turns.finish(), self._turns.recent())
             drop_sound(self.events)
 
     def _collect(self, frame: Frame, engine: ClipEngine) -> None:

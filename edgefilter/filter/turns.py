@@ -10,12 +10,14 @@ import numpy as np
 from edgefilter.dsp import fourier
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.filter.spatial import SpatialFilter
-from edgefilter.types import SAMPLE_RATE, Event, Samples, Spectrum
+from edgefilter.types import SAMPLE_RATE, Event, Samples, Spectrum, Turn
 
 LONGEST_S = 30.0
 """Of a turn that is kept; what a recogniser takes at once. Of a longer one the latest part."""
 BEFORE_S = 0.5
 """Of sound before the human was noticed: they had begun to speak, and a recogniser wants some silence first."""
+RECENT_S = 0.3
+"""Of sound up to now that goes with an event: what a human who has just been noticed has said, and a syllable before it."""
 LARGEST = 2.0
 """Most that an answer is taken to be over its error in a bin: engines add no sound, but an error can vanish."""
 WAITING_S = 600.0
@@ -57,9 +59,17 @@ class Turns:
         """A turn has begun so many frames before the latest."""
         self._begin = max(self._count - 1 - waited - self._before, 0)
 
-    def finish(self) -> tuple[int, Samples]:
-        """The turn up to the latest frame: its first sample, and its samples (n,) float32, a whole number of hops."""
-        first = max(self._begin, self._count - self._room)
+    def finish(self) -> Turn:
+        """The turn up to the latest frame, a whole number of hops."""
+        return self._since(max(self._begin, self._count - self._room))
+
+    def recent(self) -> Turn:
+        """What came in the last RECENT_S up to the latest frame, or a hop more."""
+        frames = -(-round(RECENT_S * SAMPLE_RATE) // self._stft.hop) + 1  # the latest ends with half a window
+        return self._since(max(self._count - frames, 0))
+
+    def _since(self, first: int) -> Turn:
+        """The frames from the first to the latest."""
         rows = np.arange(first, self._count) % self._room
         errors, gains = self._errors[rows], self._gains[rows]
         if self._spatial is None:
@@ -69,7 +79,7 @@ class Turns:
         hop, window = self._stft.hop, self._stft.window_length
         late = window - hop
         # frame t ends with sample (t + 1) hop, and has window samples; the first and the last late samples lack a frame
-        return max((first + 1) * hop - window, 0) + late, overlap_add(spectra, self._stft)[late : -late or None]
+        return Turn(max((first + 1) * hop - window, 0) + late, overlap_add(spectra, self._stft)[late : -late or None])
 
     def _grow(self) -> None:
         """Room for twice as many frames, and for a second at first: most streams never need all of it."""

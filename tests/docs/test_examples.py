@@ -101,6 +101,14 @@ def test_a_calibration_gives_a_profile_with_which_the_missing_effect_is_found_an
     assert (tmp_path / "better.npz").exists()
 
 
+@pytest.mark.slow
+def test_a_classifier_is_asked_whether_the_human_has_finished():
+    said, _ = run("end_of_turn.py", DEMO / "mic.flac", DEMO / "reference.flac", DEMO / "profile.npz")
+    told = [line.split(" s: ") for line in said.decode().splitlines()]
+    assert told[0][1] == "begins" and 9.0 < float(told[0][0]) < 10.0
+    assert told[-1][1] == "complete"
+
+
 @pytest.fixture(scope="module")
 def stereo():
     """The bundled conversation, 16-bit, microphone and reference."""
