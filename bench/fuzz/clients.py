@@ -2,7 +2,7 @@
 
 Each attack is a pure function of seed and number, as the damaged files are. A find: a service that dies, has taken more than
 MOST_MB beside what it began with, writes a traceback or a line that does not only print, or whose other client gets its
-answers later than LATE times what it takes alone, or not at all.
+answers later than LATE times what a client of a second service takes at the same time, which nobody attacks, or not at all.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, suppress
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -43,7 +43,8 @@ MOST_MB = 600
 """What attackers may make a service keep, most of it messages of 4 MB that have come in part: four of them, and as many that
 were cut off and are not forgotten yet."""
 LATE, HOP_MS = 3.0, 16.0
-"""How much later than alone the slowest hundredth of answers may be, and at any rate by two hops: there are two cores for all."""
+"""How much later than of the service that is left alone the slowest hundredth of answers may be, and at any rate by two hops:
+there are two cores for all."""
 ATTACKERS, PART_S = 4, 10.0
 """Clients that attack at once, and seconds after which the figures of the client in real time are taken."""
 SILENT_S = 1.0
@@ -215,8 +216,10 @@ class Watched:
         return f"{self.name} wrote {self._wrong!r}" if self._wrong else ""
 
 
-async def beside(address: str, listen: int, watched: list[Watched], seconds: float) -> tuple[list[float], float, str]:
-    """Milliseconds of the answers of a client in real time, a listener's longest silence in s, and what was wrong meanwhile."""
+async def beside(
+    ports: Sequence[int], listen: int, watched: list[Watched], seconds: float
+) -> tuple[list[list[float]], float, str]:
+    """Milliseconds of the answers of a client in real time of each port, a listener's longest silence in s, and what was wrong."""
     silence = 0.0
 
     async def listener() -> None:
@@ -230,9 +233,11 @@ async def beside(address: str, listen: int, watched: list[Watched], seconds: flo
 
     listening = asyncio.create_task(listener())
     try:
-        took = await streams(address, 1, round(HOP_MS * SAMPLE_RATE / 1000), seconds, np.random.default_rng(0))
+        hop, rng = round(HOP_MS * SAMPLE_RATE / 1000), np.random.default_rng(0)
+        both = [streams(f"ws://127.0.0.1:{port}", 1, hop, seconds, rng) for port in ports]
+        took = await asyncio.gather(*both)
     except Exception as error:
-        return [], silence, f"the client in real time: {type(error).__name__}: {error}"
+        return [[] for _ in ports], silence, f"the client in real time: {type(error).__name__}: {error}"
     told = "the listener was let go" if listening.done() else ""
     listening.cancel()
     return took, silence, next(filter(None, (told, *(each.wrong() for each in watched))), "")
@@ -242,9 +247,9 @@ def run(options: argparse.Namespace) -> str:
     """Attack both services for so many minutes; the page with the figures. Raises UsageError where there are finds."""
     made_with = results.stamp({"DEMO": [DEMO]})
     context = multiprocessing.get_context("spawn")
-    serve, microphone, loudspeaker = free_ports(3)
+    serve, quiet, microphone, loudspeaker = free_ports(4)
     ports = {"serve": serve, "microphone": microphone, "loudspeaker": loudspeaker}
-    address, stopping = f"ws://127.0.0.1:{serve}", context.Event()
+    served, stopping = (serve, quiet), context.Event()
     numbers = [context.Value("q", -1) for _ in range(ATTACKERS)]
     finds: list[str] = []
     with ExitStack() as ended:
@@ -253,16 +258,14 @@ def run(options: argparse.Namespace) -> str:
         heard = f"{sys.executable} {folder}/noise.py"
         uris = ["--mic-uri", f"tcp://127.0.0.1:{microphone}", "--snd-uri", f"tcp://127.0.0.1:{loudspeaker}"]
         spoken = ["--microphone", heard, "--loudspeaker", "dd of=/dev/null status=none", "--engine", "linear", *uris]
-        commands = {"serve": ["-m", "edgefilter.cli", "serve", "--port", str(serve), "--streams", str(ATTACKERS + 4)],
-                    "wyoming": ["-m", "edgefilter.integrations.wyoming", *spoken]}  # fmt: skip
+        service = ["-m", "edgefilter.cli", "serve", "--streams", str(ATTACKERS + 4), "--port"]
+        commands = (("serve", serve, [*service, str(serve)]), ("serve, left alone", quiet, [*service, str(quiet)]),
+                    ("wyoming", microphone, ["-m", "edgefilter.integrations.wyoming", *spoken]))  # fmt: skip
         watched = []
-        for name, port in (("serve", serve), ("wyoming", microphone)):
-            watched.append(Watched(name, commands[name], port))
+        for name, port, command in commands:
+            watched.append(Watched(name, command, port))
             ended.callback(watched[-1].process.wait)
             ended.callback(watched[-1].process.terminate)
-        took, silence, wrong = asyncio.run(beside(address, microphone, watched, PART_S))
-        alone = percentiles(took, 50, 99, 100)
-        rows = [["alone", len(took), *alone.values(), silence, *(each.most for each in watched)]]
         for at, number in enumerate(numbers):
             words = options.seed, options.start + at, ports, number, stopping
             attacker = context.Process(target=attack_all, args=words)
@@ -271,24 +274,28 @@ def run(options: argparse.Namespace) -> str:
         ended.callback(stopping.set)
         while any(number.value < 0 for number in numbers):
             time.sleep(0.1)
-        until, every, longest = time.monotonic() + 60 * options.minutes, [], 0.0
+        until, longest, wrong = time.monotonic() + 60 * options.minutes, 0.0, ""
+        every: list[list[float]] = [[], []]
         while time.monotonic() < until and not (wrong and watched[0].process.poll() is not None):
-            took, silence, wrong = asyncio.run(beside(address, microphone, watched, PART_S))
-            every, longest = every + took, max(longest, silence)
+            took, silence, wrong = asyncio.run(beside(served, microphone, watched, PART_S))
+            every, longest = [old + new for old, new in zip(every, took, strict=True)], max(longest, silence)
             if wrong and wrong not in finds:
                 finds.append(wrong)
-        figures = percentiles(every, 50, 99, 100) if every else {}
-        late = figures.get("p99", np.inf) > max(LATE * alone["p99"], alone["p99"] + 2 * HOP_MS)
-        finds += [f"answers after {figures.get('p99', np.inf):.0f} ms, alone {alone['p99']:.0f}"] if late else []
+        figures, alone = (
+            percentiles(of, 50, 99, 100) if of else {"p50": np.inf, "p99": np.inf, "max": np.inf} for of in every
+        )
+        late = figures["p99"] > max(LATE * alone["p99"], alone["p99"] + 2 * HOP_MS) or not every[0]
+        finds += [f"answers after {figures['p99']:.0f} ms, left alone {alone['p99']:.0f}"] if late else []
         finds += [f"the listener heard nothing for {longest:.1f} s"] if longest > SILENT_S else []
-        rows.append(["attacked", len(every), *figures.values(), longest, *(each.most for each in watched)])
+        rows = [[each.name, len(of), *found.values(), each.most] for each, of, found in
+                zip(watched, every, (figures, alone), strict=False)]  # fmt: skip
+        rows.append([watched[2].name, None, None, None, None, watched[2].most])
         attacks = sum(number.value - options.start for number in numbers) // ATTACKERS
-    columns = ["client", "answers", *((f"{name}, ms", 1) for name in alone), ("listener's longest silence, s", 2),
-               ("serve, MB", 0), ("wyoming, MB", 0)]  # fmt: skip
+    columns = ["service", "answers", ("p50, ms", 1), ("p99, ms", 1), ("max, ms", 1), ("MB", 0)]
     tables = [results.table("clients", "The clients that do no harm", columns, rows),
               results.table("finds", f"{len(finds)} finds", ["find"], [[find] for find in finds])]  # fmt: skip
     lines = {each.name: each.lines for each in watched}
-    notes = f"{options.minutes:g} minutes, {ATTACKERS} attackers at once; lines in the logs: {lines}."
+    notes = f"{options.minutes:g} minutes, {ATTACKERS} attackers at once; lines in the logs: {lines}; the listener's longest silence {longest:.2f} s."
     page = results.write(options.output, "clients", f"{attacks} hostile clients", made_with, tables, notes=notes,
                          attacks=attacks, finds=finds, rows=rows)  # fmt: skip
     if finds:
