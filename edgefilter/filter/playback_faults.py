@@ -72,6 +72,10 @@ class GrowingLag:
 
     def grown(self, now: int) -> int:
         """Samples by which it has grown of late; 0 unless it did so TIMES within WITHIN."""
+        return 0 if self.holds(now) or len(self._steps) < TIMES else round(sum(by for _, by in self._steps))
+
+    def holds(self, now: int) -> bool:
+        """Whether it has not grown within WITHIN."""
         while self._steps and self._steps[0][0] < now - WITHIN:
             self._steps.popleft()
-        return round(sum(by for _, by in self._steps)) if len(self._steps) >= TIMES else 0
+        return not self._steps

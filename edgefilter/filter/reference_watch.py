@@ -10,7 +10,7 @@ import numpy as np
 
 from edgefilter.alignment.aligner import COARSE_MARGIN
 from edgefilter.alignment.delay_line import WAIT, Aligned, Tape
-from edgefilter.alignment.lag_search import CERTAIN, WINDOW, LagSearch
+from edgefilter.alignment.lag_search import CERTAIN, SEEN_ODDS, WINDOW, Found, LagSearch
 from edgefilter.alignment.utterances import FLOOR, NEVER, OnsetDetector
 from edgefilter.dsp import fourier
 from edgefilter.dsp.lag import one_signal
@@ -72,7 +72,7 @@ class ReferenceWatch:
         self.verdict: Verdict = "unknown"
         self.without = self.same = False
         self._late = self._stage = self._looks = self._in_time = 0
-        self._seen_at = NEVER
+        self._seen_at, self._seen_apart, self._seen_last = NEVER, 0, NEVER
         self._growing, self._lacks = GrowingLag(), False
         self._speed: float | None = None
         self._off_speed, self._to_compare, self._compared = False, 0, 0
@@ -138,7 +138,8 @@ class ReferenceWatch:
 
     def _unpredicted(self, removal: Removal) -> str:
         """Say that hardly anything of the robot can be subtracted."""
-        if not removal.unpredicted or self._displaced or not self._once("unpredicted"):
+        holds = self._growing.holds(self._ref.end)  # of a lag that has just changed nothing is learned yet
+        if not removal.unpredicted or self._displaced or not holds or not self._once("unpredicted"):
             return ""
         return (
             f"the linear stage removes only {removal.removed_db:.1f} dB of the robot: the microphone seems to be processed, the"
@@ -252,14 +253,28 @@ class ReferenceWatch:
 
     def _decide(self, aligned: Aligned) -> list[tuple[EventKind, str]]:
         found = self._search.find()
-        if found is None or found.odds < CERTAIN or found.lag < WAIT or self._resembles_earlier(found.lag):
-            self._looks += 1
-            if self._looks >= IN_VAIN and (self.verdict == "unknown" or aligned.state == "locked"):
-                self.verdict = "fits"
-            return []
-        again = abs(found.lag - self._seen_at) <= AGREE
-        self._seen_at, self._looks = found.lag, 0
-        return self._found_late(found.lag) if again else []
+        if found and self._agrees(found) and not self._resembles_earlier(found.lag):
+            self._looks = 0
+            return self._found_late(found.lag)
+        self._looks += 1
+        if self._looks >= IN_VAIN and (self.verdict == "unknown" or aligned.state == "locked"):
+            self.verdict = "fits"
+        return []
+
+    def _agrees(self, found: Found) -> bool:
+        """Whether the lateness that a look found is certain by what it and those before it saw at the same lag.
+
+        A look that shares no sound with one that saw the lag before makes it SEEN_ODDS more likely; one that is more likely
+        wrong than right does not contradict them.
+        """
+        if found.lag >= WAIT and abs(found.lag - self._seen_at) <= AGREE:
+            if found.at - self._seen_last >= WINDOW:
+                self._seen_apart, self._seen_last = self._seen_apart + 1, found.at
+            self._seen_at = found.lag
+            return found.odds * SEEN_ODDS**self._seen_apart > CERTAIN
+        if found.odds > 1.0:
+            self._seen_at, self._seen_apart, self._seen_last = found.lag, 0, found.at
+        return False
 
     def _found_late(self, samples: int) -> list[tuple[EventKind, str]]:
         """The reference is late by so many samples; what is to be said."""

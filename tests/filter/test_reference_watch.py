@@ -10,6 +10,7 @@ from scipy import signal
 import edgefilter
 from edgefilter import EgoFilter
 from edgefilter.alignment.delay_line import Aligned
+from edgefilter.alignment.lag_search import Found
 from edgefilter.filter.barge_in import BargeIn
 from edgefilter.filter.reference_watch import ReferenceWatch
 from edgefilter.filter.removal import Removal
@@ -80,6 +81,15 @@ def test_the_microphone_waits_for_a_reference_that_comes_some_milliseconds_late(
     before, left = (float(np.mean(np.square(x[3 * RATE :]))) for x in (mic, out))
     assert 10 * np.log10(before / left) > 24.0  # 27 dB where the reference is 4 ms early; without waiting 20 and 2
     assert not {event.kind for event in ego.events()} & set(SET_UP_WRONG)
+
+
+def test_a_lateness_that_looks_at_different_sounds_agree_on_is_certain_though_each_is_weak():
+    watch, weak, strong = ReferenceWatch(256, 257), 1.4, 2.4
+    looks = [(2088, weak, 0), (2098, weak, 4096), (2111, weak, 8192), (5000, 1.0, 12288), (2105, weak, 16384)]
+    assert [watch._agrees(Found(*look)) for look in looks] == [False, False, False, False, True]
+    assert not watch._agrees(Found(7000, weak, 20480)) and not watch._agrees(Found(2105, weak, 24576))
+    assert not watch._agrees(Found(900, strong, 28672)) and watch._agrees(Found(910, strong, 32768))
+    assert not any(watch._agrees(Found(60, strong, 36864 + at)) for at in (0, 8192)), "the microphone waits"
 
 
 def test_a_search_that_rests_while_the_reference_is_late_is_given_up(robot):
