@@ -16,7 +16,7 @@ from edgefilter.echo.evidence import Evidence
 from tests.diagnosis.robot_scene import profile, record, voice
 from tests.diagnosis.test_packet_loss import coded, lossy
 
-SECONDS = 12.0
+SECONDS = 8.0
 
 
 def evidence(recording: np.ndarray, x: np.ndarray) -> Evidence:

@@ -42,7 +42,7 @@ def gained(recording: np.ndarray, gain_db: np.ndarray) -> np.ndarray:
 def test_one_recording_has_one_excess_in_compare_add_diagnose_and_report_when_the_profile_holds_a_microphone_gain() -> (
     None
 ):
-    x, gain_db = voice(10.0), 6 * np.hanning(400)
+    x, gain_db = voice(8.0), 6 * np.hanning(320)
     plain = profile()
     robot = plain.with_echo(plain.echo.with_effect("mic_agc", {"gain_db": gain_db, "knots_hz": 40.0}))
     recording = gained(record(x, plain.echo.with_effect("playback_gain", {"gain_db": -2.0})), gain_db)
@@ -85,7 +85,7 @@ def test_a_fan_of_digital_zeros_gives_figures_and_no_infinities() -> None:
 
 @pytest.mark.slow
 def test_the_words_name_a_band_of_the_scorer() -> None:
-    x = voice(10.0)
+    x = voice(8.0)
     clean = EchoModel(path()).predict(delayed(x, DELAY - PRE_ROLL))
     tone = signal.sosfilt(signal.butter(4, [1500, 2000], "band", fs=RATE, output="sos"), clean)
     ring = tone * np.sin(2 * np.pi * 170 * np.arange(x.size) / RATE)
@@ -239,7 +239,7 @@ def coloured(x: np.ndarray) -> np.ndarray:
 
 @pytest.mark.slow
 def test_another_colour_of_the_loudspeaker_is_not_called_late_reverberation() -> None:
-    x = voice(12.0)
+    x = voice(8.0)
     clean = coloured(EchoModel(path()).predict(delayed(x, DELAY - PRE_ROLL)))
     found = diagnose(profile(), (clean + FAN * np.random.default_rng(3).standard_normal(x.size)).astype(np.float32), x)
     assert "late_reverb" not in [finding.effect for finding in found.ranking]
@@ -248,7 +248,7 @@ def test_another_colour_of_the_loudspeaker_is_not_called_late_reverberation() ->
 
 @pytest.mark.slow
 def test_a_room_that_sounds_longer_is_called_late_reverberation() -> None:
-    x, rng = voice(12.0), np.random.default_rng(8)
+    x, rng = voice(8.0), np.random.default_rng(8)
     tail = np.arange(RATE // 2)
     room = np.concatenate((np.zeros(60), 0.01 * rng.standard_normal(tail.size) * np.exp(-6.9 * tail / (0.6 * RATE))))
     clean = EchoModel(path()).predict(delayed(x, DELAY - PRE_ROLL)).astype(float)

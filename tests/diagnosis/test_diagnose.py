@@ -25,7 +25,7 @@ from edgefilter.echo.wiener import spectra
 from edgefilter.types import PRE_ROLL
 from tests.diagnosis.robot_scene import DELAY, FAN, livelier, path, profile, record, voice
 
-SECONDS = 12.0
+SECONDS = 9.0
 
 
 def fan(seed: int = 3) -> np.ndarray:
@@ -123,7 +123,7 @@ def test_a_turned_volume_is_found_beside_a_fan_that_hides_it() -> None:
 def test_things_that_slam_now_and_then_are_no_fan() -> None:
     x = voice(SECONDS)
     slams = np.zeros(x.size)
-    for at in (1.6, 3.7, 9.65):
+    for at in (1.6, 3.7, 5.65):
         part = slams[round(at * 16000) :][:3200]
         part += (
             40 * FAN * np.random.default_rng(round(at)).standard_normal(part.size) * np.exp(-np.arange(part.size) / 500)

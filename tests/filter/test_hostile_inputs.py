@@ -9,7 +9,7 @@ from edgefilter.echo.model import EchoModel
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE
 from tests.alignment.scene import speech_like
 
-SECONDS = 8
+SECONDS = 6
 SIZE = SECONDS * SAMPLE_RATE
 INAUDIBLE = 1e-9
 """Mean square, -90 dB of full scale, added to both sides: of digital silence nothing can be a decibel louder."""
@@ -51,7 +51,7 @@ def swapped_channels() -> tuple[np.ndarray, np.ndarray]:
 def lag_jumps_every_second() -> tuple[np.ndarray, np.ndarray]:
     ref, _, human, fan, path = scene()
     echo = np.zeros(SIZE, np.float32)
-    for second, delay in enumerate((300, 4000, 900, 12000, 100, 7000, 2500, 500)):
+    for second, delay in enumerate((300, 4000, 900, 12000, 100, 7000)):
         part = slice(second * SAMPLE_RATE, (second + 1) * SAMPLE_RATE)
         echo[part] = heard(ref, path, delay)[part]
     return echo + human + fan, ref
@@ -60,9 +60,7 @@ def lag_jumps_every_second() -> tuple[np.ndarray, np.ndarray]:
 def volume_turned() -> tuple[np.ndarray, np.ndarray]:
     ref, echo, human, fan, _ = scene()
     return (
-        np.repeat([0.1, 1.0, 10.0, 0.3, 3.0, 0.1, 10.0, 1.0], SAMPLE_RATE).astype(np.float32) * 0.1 * echo
-        + human
-        + fan,
+        np.repeat([0.1, 10.0, 0.3, 3.0, 0.1, 10.0], SAMPLE_RATE).astype(np.float32) * 0.1 * echo + human + fan,
         ref,
     )
 
@@ -76,7 +74,7 @@ def path_changes_at_once() -> tuple[np.ndarray, np.ndarray]:
 def clipped_and_silent() -> tuple[np.ndarray, np.ndarray]:
     ref, echo, human, fan, _ = scene()
     mic = np.clip(5.0 * echo + human + fan, -0.3, 0.3)
-    for channel, at in ((mic, 2), (ref, 3), (mic, 5), (ref, 6)):
+    for channel, at in ((mic, 1), (ref, 2), (mic, 4), (ref, 5)):
         channel[at * SAMPLE_RATE : at * SAMPLE_RATE + SAMPLE_RATE // 2] = 0.0
     return mic, ref
 
@@ -161,7 +159,7 @@ def test_the_profile_of_these_scenes_is_true():
 def test_one_loud_sample_of_the_reference_costs_the_rest_next_to_nothing(click):
     """It lies in the first of two utterances, the second of which has another lag and is evaluated."""
     ref, _, _, fan, path = scene()
-    pause = slice(7 * SAMPLE_RATE // 2, 9 * SAMPLE_RATE // 2)
+    pause = slice(5 * SAMPLE_RATE // 2, 7 * SAMPLE_RATE // 2)
     ref[pause] = 0.0
     echo = np.concatenate((heard(ref, path, 900)[: pause.stop], heard(ref, path, 6000)[pause.stop :]))
     clicked = ref.copy()

@@ -41,7 +41,7 @@ def receive():
         )
 
     with LiveSource("robot_mic_monitor", monitor_of("robot")) as source:
-        mic, ref, blocks = collect(limited(source, 6 * 16000), play)
+        mic, ref, blocks = collect(limited(source, 4 * 16000), play)
     for player in players:
         player.wait()
     np.savez(folder / "received.npz", mic=mic, ref=ref)
@@ -67,7 +67,7 @@ def sink():
     heard = []
     source = LiveSource("robot_mic_monitor")
     with source:
-        reader = threading.Thread(target=lambda: heard.extend(collect(limited(source, 6 * 16000))[:1]))
+        reader = threading.Thread(target=lambda: heard.extend(collect(limited(source, 4 * 16000))[:1]))
         reader.start()
         with LiveSink("robot_mic", latency=512) as output:
             for start in range(0, sound.size, 256):
