@@ -2,7 +2,8 @@
 
 An agent's two directions share no sample counter. It hands speech over in bursts, faster than it is played, or late,
 and drops the rest when it is interrupted. Here the microphone is the clock: speech waits in a queue, and each sample of
-the microphone takes one from it, as the loudspeaker does; what the microphone has lost by the clock takes some, too.
+the microphone takes one from it, as the loudspeaker does; what the microphone has lost by the clock takes some, too, and is
+silence for the filter, which knows then what is still to be heard of it.
 Speech that is dropped from the queue was never played and is no reference. The filter's aligner finds how much later the reference is heard.
 """
 
@@ -36,6 +37,8 @@ WAITED_S, HELD_S = 1e-3, 0.1
 at once. HELD_S: a delay from which on the microphone's samples are buffered until it is clear whether some were lost."""
 BACK_S = 2.0
 """Seconds of reference that are kept, to be used again where sound that seemed lost comes after all."""
+FILLED_S = 1.0
+"""Most of it that is filled with silence at once, which takes 0.1 to 0.3 s to compute: more than rooms and buffers hold back."""
 PATIENCE_S = 0.12
 """How long the microphone waits for late speech: three times the 40 ms that a Pipecat transport hands over at once."""
 PACE_S, PACE_NEAR = 5.0, 0.01
@@ -72,7 +75,8 @@ class Duplex:
     Attributes
     ----------
     heard : int
-        Samples of the microphone so far, at 16 kHz, by which events and turns are counted.
+        Samples of the microphone so far, at 16 kHz, by which events and turns are counted; lost ones that silence stands in for
+        are among them.
     listeners : list of callable
         Called with each `Event` beside on_event, in the thread of `hear`.
     enabled : bool
@@ -126,6 +130,7 @@ class Duplex:
         self._pace = Pace(clock)
         self._losses, self._delivered_s, self._timed = SampleClock(LOOK_S, STALL_S), 0.0, False
         self._taken: deque[Samples] = deque()
+        self._unheard, self._came = np.zeros(0, np.float32), np.zeros(0, bool)
         self._kept: deque[Event] = deque(maxlen=1000)
         self.enabled = True
         self._talking = self._paused = self._held = self._deaf = self._averaged = False
@@ -196,14 +201,13 @@ class Duplex:
             mic, self._mic = self._mic[: reference.size], self._mic[reference.size :]
             if self._both:
                 mic, reference = mic[:, :-1], mic[:, -1]
-            human = self.ego.process(mic, reference)
+            human = self._filter(mic, reference)
             if human.size:
                 self._warn_if_deaf()
             human = self._to_agent.push(human)
             events = self.ego.events()
             if wrong := self._pace.note(len(samples), rate):
                 events.append(Event("rate_mismatch", self.heard, wrong))
-            self.heard += len(mic)
             self._left_at = self._clock()
         for event in events:
             if event.kind in SET_UP_WRONG:
@@ -266,6 +270,18 @@ class Duplex:
         """End the filter's learner, if it has one."""
         self.ego.close()
 
+    def _filter(self, mic: Samples, reference: Samples) -> Samples:
+        """What the filter answers to samples of the microphone; silence stands in before them where some were lost."""
+        lost, self._unheard = self._unheard, self._unheard[:0]
+        came = np.ones(lost.size + len(mic), bool)
+        came[: lost.size] = False
+        self.heard += came.size
+        self._came = np.concatenate((self._came, came))
+        silence = np.zeros((lost.size, *mic.shape[1:]), np.float32)
+        human = self.ego.process(np.concatenate((silence, mic)), np.concatenate((lost, reference)))
+        came, self._came = self._came[: human.size], self._came[human.size :]
+        return human[came]
+
     def _warn_if_deaf(self) -> None:
         """Log once, each time it begins, that the engine at work judges no speech, and once that one does again."""
         deaf, self._deaf = self._deaf, self.ego.speech_probability is None
@@ -309,7 +325,9 @@ class Duplex:
             lost_s = self._losses.note(self._delivered_s, now if at_s is None else at_s + heard_s)
             self._held = self._talking and self._losses.doubt_s > HELD_S
             if lost_s > 0.0:
-                self._take(round(min(lost_s, max(now - self._talking_since, 0.0)) * SAMPLE_RATE), "unheard")
+                count = round(min(lost_s, max(now - self._talking_since, 0.0)) * SAMPLE_RATE)
+                skipped = self._take(count, "unheard")[-round(FILLED_S * SAMPLE_RATE) :]
+                self._unheard = skipped[:0] if self._both else skipped
             elif lost_s < 0.0:
                 self._put_back(min(round(-lost_s * SAMPLE_RATE), self._samples["unheard"]))
 

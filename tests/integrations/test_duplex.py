@@ -278,11 +278,12 @@ def test_a_loss_shows_at_once_in_frames_that_carry_their_time(witness):
         clock.now = 1.0 + 0.02 * k
         duplex.hear(np.zeros(320, np.float32), RATE, at_s=0.02 * k)
     assert duplex.stats()["unheard_s"] == pytest.approx(0.3, abs=1e-3)
-    np.testing.assert_array_equal(witness.reference[40 * 320 : 41 * 320], SAID[55 * 320 : 56 * 320])
+    np.testing.assert_array_equal(witness.reference, SAID[: 80 * 320])  # the filter gets what was lost, too
 
 
 @pytest.mark.slow
 def test_a_robot_is_removed_though_the_microphone_lost_a_fifth_of_a_second_of_it(room_of):
+    """What was lost of its reference is still to be heard then, for as long as the lag: it passed, and was taken for a human."""
     mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
     clock = Clock()
     duplex, out, happened = Duplex(EgoFilter(room_of.PROFILE, "crnn"), clock=clock), [], []
@@ -292,10 +293,11 @@ def test_a_robot_is_removed_though_the_microphone_lost_a_fifth_of_a_second_of_it
         if not 3.0 <= at / RATE < 3.2:
             out.append(duplex.hear(mic[at : at + 320], RATE))
         happened += duplex.events()
-    human = np.concatenate(out)[round(3.4 * RATE) :]
-    heard = mic[round(3.6 * RATE) : 6 * RATE]
+    human = np.concatenate(out)
+    assert 0 <= round(5.8 * RATE) - human.size <= duplex.ego.latency
+    human, heard = human[3 * RATE :], mic[round(3.2 * RATE) : 6 * RATE]
     assert 10 * np.log10(np.mean(heard**2) / np.mean(human**2)) > 20.0
-    assert not {event.kind for event in happened} & {"reference_late", "echo_unpredicted"}
+    assert not {event.kind for event in happened} & {"reference_late", "echo_unpredicted", "speech_started"}
 
 
 def test_a_paused_loudspeaker_goes_on_where_it_stopped_but_for_what_it_threw_away(witness):
