@@ -97,7 +97,7 @@ class Aligner:
         )
 
     def hear_by(self, used: Sequence[int]) -> None:
-        """From now on these microphones of an array are used; the delay holds, since calibrated paths have one beginning."""
+        """Use these microphones of an array from now on; the delay stays, since their calibrated paths share one time origin."""
         self._mics += [Tape(self._ref.capacity) for _ in range(len(self._mics), max(used) + 1)]
         first, self._used = self._used[0], list(used)
         if self._responses is not None and self._used[0] != first:
@@ -317,7 +317,7 @@ class Aligner:
         return False
 
     def _jump(self, offset: float) -> bool:
-        """The delay has jumped by offset."""
+        """Follow a jump of the delay by `offset` samples; True, as the delay was switched."""
         self._counts["jumps"] += 1
         self._log_odds = math.log(CERTAIN)
         if self._open and self._ref.end - self._drift.delay > self._open[0].start + STRIDE:

@@ -26,7 +26,8 @@ REFLECTIONS, REFLECTED = 320, 0.75
 COARSE = 32
 """Samples over which the energies that lags let overlap are summed."""
 NEAR, ASIDE = 12, 512
-"""Lags on each side of a peak that are the same peak, and those that an earlier window is compared at."""
+"""Lags on each side of a peak that belong to it, and lags on each side of the one found over which `before` correlates the
+earlier window."""
 BETWEEN = 1024
 """Samples between the two windows, so that one short agreement does not reach into both."""
 SEEN, SEEN_ODDS = 5.0, 20.0
@@ -117,8 +118,8 @@ class LagSearch:
     def find(self) -> Found | None:
         """The best lag; None where there is nothing to compare, or less than MINIMUM of it would overlap.
 
-        Of several microphones that of the first, or where it is clearer the best of what each lag has in the second best of
-        them: a lag that is seen in one alone may be that of a loopback.
+        Several microphones: the first one's best lag, or the best lag of their second highest scores where that is clearer: a
+        lag that only one channel shows may be a loopback's.
         """
         if not self._crosses:
             return None

@@ -204,7 +204,7 @@ class EgoFilter:
         -------
         ndarray of float32, shape (n, microphones)
             What came since the last call, whole hops, 30 s at most; sample i of all of them belongs to sample i of the
-            input, or is up to 14 ms later while the microphone waits for a late reference. Fan and room are in it.
+            input, or is up to 10 ms later while the microphone waits for a late reference. Fan and room are in it.
             Nothing without `keep_channels`, or from an engine without a linear stage.
         """
         return self._stream.robot_removed()

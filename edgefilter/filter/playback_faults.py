@@ -75,7 +75,7 @@ class GrowingLag:
         return 0 if self.holds(now) or len(self._steps) < TIMES else round(sum(by for _, by in self._steps))
 
     def holds(self, now: int) -> bool:
-        """Whether it has not grown within WITHIN."""
+        """Whether the lag has not grown in the last 10 s."""
         while self._steps and self._steps[0][0] < now - WITHIN:
             self._steps.popleft()
         return not self._steps

@@ -34,8 +34,8 @@ DOUBT = SAMPLE_RATE // 2
 """Samples for which speech that begins while the reference is silent waits for it, until it is known to come in time: an
 onset of the robot's is no human's if the reference follows."""
 UNFOUND, LOUDER = 5 * SAMPLE_RATE, 10.0
-"""Samples of a reference that is not found, and by how much more power the microphone must have then than while the
-reference is silent, for the robot to be heard: 10 dB, more than people who talk half of the time bring about."""
+"""Samples of reference, 5 s, that must have played without being found, and the ratio of the microphone's power meanwhile to its power
+while the reference is silent, 10 dB, from which on the robot is heard: people who talk half of the time cause less."""
 MISSING, HEARD = 60 * SAMPLE_RATE, 10 * SAMPLE_RATE
 """Samples without any reference, of which so many were not silent at the microphone, SILENT of full scale: a level of the
 converter, since there is nothing else to compare with. 16 bits by themselves are 41 dB softer."""
@@ -93,7 +93,7 @@ class ReferenceWatch:
 
     @property
     def _displaced(self) -> bool:
-        """Whether it is known why the echo is not where the reference says."""
+        """Whether a fault of the reference is known: it is late, lacks samples or has another speed."""
         return self.verdict == "late" or self._lacks or self._off_speed
 
     @property
@@ -294,16 +294,16 @@ class ReferenceWatch:
         return found is not None and abs(found.lag - lag) <= COARSE_MARGIN + PRE_ROLL
 
     def _prepare(self, tape: Tape) -> None:
-        """Look in what that holds from LATEST before the utterance on."""
+        """Begin a search for the present utterance in that tape, from LATEST before its beginning on."""
         self._search.prepare(tape, self._ref.end, self._onsets.current.start - LATEST)
 
     def _listen(self) -> None:
-        """Look for the utterance."""
+        """Give the search the utterance's latest WINDOW of the reference."""
         now = self._ref.end
         self._search.listen({0: self._ref}, now, max(self._onsets.current.start, now - WINDOW))
 
     def _weigh(self, power: float, aligned: Aligned) -> str:
-        """Compare the microphone while the reference is found nowhere with the microphone while it is silent."""
+        """Compare the microphone's power while the reference plays but is not found with that while the reference is silent."""
         if aligned.state == "locked":
             self._power["unfound"] = [0.0, 0]
             self._said.discard("unfound")

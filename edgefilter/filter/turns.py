@@ -17,7 +17,7 @@ LONGEST_S = 30.0
 BEFORE_S = 0.5
 """Of sound before the human was noticed: they had begun to speak, and a recogniser wants some silence first."""
 RECENT_S = 0.3
-"""Of sound up to now that goes with an event: what a human who has just been noticed has said, and a syllable before it."""
+"""Seconds of the latest output that an event carries: what a human who was just noticed has said so far, and a syllable before."""
 LARGEST = 2.0
 """Most that an answer is taken to be over its error in a bin: engines add no sound, but an error can vanish."""
 WAITING_S = 600.0
