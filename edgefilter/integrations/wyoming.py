@@ -200,6 +200,8 @@ class EgoService:
 class _Command(MicProcessAsyncClient):
     """The microphone's command."""
 
+    _proc: asyncio.subprocess.Process | None
+
     async def disconnect(self) -> None:
         process, self._proc = self._proc, None
         assert process is not None
