@@ -86,9 +86,9 @@ def peer(name: str, stack: ExitStack) -> Contender:
 
 
 def _timed(inner: Callable, times: list[float]) -> Callable:
-    def timed(*arguments: object) -> object:
+    def timed(*arguments: object, **named: object) -> object:
         start = time.perf_counter()
-        result = inner(*arguments)
+        result = inner(*arguments, **named)
         times.append(1000 * (time.perf_counter() - start))
         return result
 

@@ -52,7 +52,7 @@ def smoke(options: argparse.Namespace) -> None:
             powers = {name: np.full(shape, level, np.uint8) for name, level in (("noise", 60), ("residual", 90))}
             scales = {name: np.float32(0.9) for name in ("scale", "reference_scale")}
             np.savez(folder / f"{index:05d}.npz", **packed, **powers, **scales)
-    options.steps, options.every, options.batch, options.seconds = 4, 2, 2, 0.2
+    options.steps, options.every, options.batch, options.seconds = 4, 2, 2, 0.7
 
 
 def arguments(argv: list[str] | None = None) -> argparse.Namespace:
