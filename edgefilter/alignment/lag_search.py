@@ -35,8 +35,8 @@ SEEN, SEEN_ODDS = 5.0, 20.0
 lags have 10 there, chance 3.3."""
 EVEN, STEEP, EARLY_ODDS = 1.37, 9.9, 0.05
 """Clearness of a lag that is as likely right as not, the power of it that the odds grow with, and what is left of the odds where the
-reference would come more than WAIT after its echo. Fitted to 12 minutes of robots in measured rooms, beside noise and humans up to 5 dB louder,
-and as many of other speech while the robot is not heard."""
+reference would come more than WAIT after its echo. Fitted to 12 minutes of robots in measured rooms, beside noise and humans
+up to 5 dB louder, and as many of other speech while the robot is not heard."""
 CERTAIN = 100.0
 """Odds from which on a lag is believed: while a human and an unheard robot talk all the time, a wrong one in an hour."""
 

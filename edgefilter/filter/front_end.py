@@ -196,9 +196,10 @@ class FrontEnd:
 
     def _waiting(self, mic: Samples, wait: int) -> Samples:
         """The hop of mic (..., hop) that ends `wait` samples before the latest one, WAIT at most."""
-        before = np.zeros_like(mic[..., :WAIT]) if self._tail is None else self._tail
-        self._tail = mic[..., -WAIT:]
-        return np.concatenate((before[..., WAIT - wait :], mic[..., : mic.shape[-1] - wait]), axis=-1) if wait else mic
+        before = np.zeros((*mic.shape[:-1], WAIT), np.float32) if self._tail is None else self._tail
+        heard = np.concatenate((before, mic), axis=-1)
+        self._tail = heard[..., -WAIT:]
+        return heard[..., WAIT - wait : heard.shape[-1] - wait]
 
     def first_of(self, mic: Samples) -> Samples:
         """Of all (microphones, ...) that of the microphone that the answer sounds like (...,); of a single one as it is."""

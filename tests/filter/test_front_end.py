@@ -8,6 +8,8 @@ import soundfile
 from scipy import signal
 
 from edgefilter import enhance
+from edgefilter.alignment.delay_line import WAIT
+from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.linear import Linear
 from edgefilter.filter.budget import DEMO
 from edgefilter.filter.echo_path import Lesson, PathState
@@ -36,6 +38,20 @@ def test_all_spectra_of_a_frame_lose_the_same_rumble():
         frame, _ = front.step(hop, 0 * hop)
     assert np.array_equal(frame.mic, frame.error)
     assert np.abs(frame.mic[0]) < 0.1 * np.abs(frame.mic[3:]).max()
+
+
+@pytest.mark.parametrize(("hop", "microphones"), [(256, None), (128, None), (128, 2)])
+def test_a_microphone_that_waits_is_late_by_so_much_however_short_the_hops_are(hop, microphones):
+    stft = StftConfig(512, hop, 512, "hann")
+    mic = (
+        np.random.default_rng(0).standard_normal((*([microphones] if microphones else []), 20 * hop)).astype(np.float32)
+    )
+    for wait in (0, 40, WAIT):
+        front = FrontEnd(Linear(stft), None, microphones=microphones)
+        hops = [front._waiting(mic[..., at : at + hop], wait) for at in range(0, mic.shape[-1], hop)]
+        heard = np.concatenate(hops, axis=-1)
+        np.testing.assert_array_equal(heard[..., wait:], mic[..., : mic.shape[-1] - wait])
+        assert not heard[..., :wait].any()
 
 
 def test_a_frame_says_whether_nothing_of_the_robot_can_be_heard():
