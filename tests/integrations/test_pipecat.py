@@ -32,7 +32,9 @@ def test_a_robot_that_talks_is_interrupted_and_its_reference_is_what_it_played(e
     log, room, _ = asyncio.run(asyncio.wait_for(example("agent_pipecat").converse(ego), 120))
     check_conversation(room, ego, 3.0)
     kinds = [what.split(":")[0] for _, what in log]
-    assert kinds == ["the robot speaks", "the human speaks", "the robot is silent", "the human said"]
+    again = ["the robot speaks", "the robot is silent"]  # Pipecat may deliver one frame taken before the interruption
+    once = ["the robot speaks", "the human speaks", "the robot is silent"]
+    assert kinds in ([*once, "the human said"], [*once, *again, "the human said"])
 
 
 def test_both_faces_are_filters_of_a_transport(filters):
