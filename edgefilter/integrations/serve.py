@@ -135,21 +135,19 @@ class Session:
         yield [_text("ended", **figures, **self._counts(), deadline=stats["deadline"])]
 
     def _announce(self, utterance: bytes) -> Iterator[list[Answer]]:
-        whole, parts = Resampler(self.form.rate, SAMPLE_RATE), []
-        for pcm in _cut(utterance, self.form.rate // 4, 1):
+        whole, samples, parts = Resampler(self.form.rate, SAMPLE_RATE), from_pcm16(utterance), []
+        for at in range(0, samples.size, self.form.rate // 4):
             yield []
-            parts.append(whole.push(from_pcm16(pcm)))
+            parts.append(whole.push(samples[at : at + self.form.rate // 4]))
         parts.append(whole.push(np.zeros(0, np.float32), last=True))
         self.ego.announce(np.concatenate(parts))
 
     def _stereo(self, message: bytes) -> Iterator[list[Answer]]:
         channels = self.form.microphones + 1
-        came = len(message) // (2 * channels)
-        if wrong := self._pace.note(came, self.form.rate):
+        both = of_pcm16(message, channels)
+        if wrong := self._pace.note(len(both), self.form.rate):
             yield [self._told(Event("rate_mismatch", self.ego.stats()["samples"], wrong))]
-        for pcm in _cut(message, self._part, channels):
-            both = of_pcm16(pcm, channels)
-            yield from self._filter(taken(both, range(channels - 1)), np.ascontiguousarray(both[:, -1]))
+        yield from self._filter(taken(both, range(channels - 1)), np.ascontiguousarray(both[:, -1]))
 
     def _filter(self, mic: Samples, ref: Samples) -> Iterator[list[Answer]]:
         for at in range(0, len(mic), self._part):
@@ -407,14 +405,6 @@ def _refuse(connection: ServerConnection, why: str) -> None:
 def _let_go(connection: ServerConnection) -> None:
     _LOGGER.warning("client %s reads too slowly; its connection is closed", connection.remote_address)
     connection.transport.abort()
-
-
-def _cut(pcm: bytes, size: int, channels: int) -> Iterator[memoryview]:
-    """16-bit samples, interleaved, in parts of so many: of 4 MB the conversion alone would hold up others for long."""
-    whole = len(pcm) - len(pcm) % (2 * channels)
-    for at in range(0, whole, 2 * channels * size):
-        yield memoryview(pcm)[at : min(at + 2 * channels * size, whole)]
-    of_pcm16(memoryview(pcm)[whole:], channels)
 
 
 def _microphones_of(pcm: bytes, count: int) -> Samples:
