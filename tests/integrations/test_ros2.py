@@ -144,7 +144,7 @@ def test_the_node_gives_the_human_and_barge_in_also_after_it_was_killed_and_star
         try:
             robot.wait_for_node()
             sound, told = robot.converse(room_of)
-            reports = [message.status[0] for message in robot.reports.take(100)]
+            reports = [message.status[0] for message in received(robot.reports)]
         finally:
             process.send_signal(number)
             assert process.wait(20) == (0 if number == signal.SIGTERM else -number)
@@ -175,11 +175,11 @@ def test_of_an_array_the_named_channels_are_its_microphones_and_the_human_is_one
         for at in range(0, len(pcm) - FRAME, FRAME):
             robot.mic.write(Audio(data=list(pcm[at : at + FRAME].tobytes())))
             time.sleep(0.005)
-            heard += b"".join(bytes(message.data) for message in robot.human.take(200))
+            heard += b"".join(bytes(message.data) for message in received(robot.human))
         until = time.monotonic() + 20.0
         while len(heard) <= 2 * 2.5 * RATE and time.monotonic() < until:  # a busy machine is behind
             time.sleep(0.05)
-            heard += b"".join(bytes(message.data) for message in robot.human.take(200))
+            heard += b"".join(bytes(message.data) for message in received(robot.human))
     finally:
         process.send_signal(signal.SIGTERM)
         assert process.wait(20) == 0
