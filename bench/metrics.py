@@ -178,7 +178,7 @@ def first_sound(human: Samples) -> int:
 
 def noticed(events: Sequence[Event], onset: int) -> dict:
     """delay_s: from the onset to the next speech_started, None without one; early: speech was on already."""
-    talk = [event for event in events if event.kind.startswith("speech")]
+    talk = [event for event in events if event.kind in ("speech_started", "speech_stopped")]
     before = [event.kind for event in talk if event.sample < onset]
     after = [event.sample for event in talk if event.sample >= onset and event.kind == "speech_started"]
     early = bool(before) and before[-1] == "speech_started"

@@ -22,6 +22,7 @@ from edgefilter.echo.effects.catalogue import names
 from edgefilter.echo.user_effects import load_effect
 from edgefilter.engines import ENGINES, HAVE_MODEL
 from edgefilter.errors import EdgefilterError, UsageError, printable
+from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.types import ALL_CHANNELS, MOST_MICROPHONES
 
 ENGINE = {
@@ -39,6 +40,14 @@ EFFECTS = {
     "default": [],
     "metavar": "FILE.py",
     "help": "an effect of your own (docs/own_effect.md); repeatable",
+}
+
+
+CONFIRM = {
+    "type": lambda text: number(0.0, 10.0, "a time from 0 to 10 s", closed=True)(text),
+    "default": BargeInSettings.confirm_s,
+    "metavar": "S",
+    "help": "longest time from the suspicion that the human speaks to certainty; 0: the suspicion is enough (default: %(default)g)",
 }
 
 
@@ -124,6 +133,9 @@ def _run(commands: argparse._SubParsersAction) -> None:
         "run this in a shell whenever the human begins to speak; EDGEFILTER_EVENT and EDGEFILTER_TIME say what and when"
     )
     option("--on-barge-in", type=command, metavar="COMMAND", help=told)
+    told = "the same when the human may have begun (speech_suspected) and when nobody has (speech_dismissed)"
+    option("--on-suspicion", type=command, metavar="COMMAND", help=told)
+    option("--confirm-s", **CONFIRM)
     option("--play", metavar="FILE", help="live: play this speech of the robot, which then is the reference")
     option("--speaker", metavar="DEVICE", help="output device for --play (default: default)")
     told = "when the human begins to speak, end what --play plays, or lower it by 10 dB until the human is quiet"
@@ -289,6 +301,7 @@ def _serve(commands: argparse._SubParsersAction) -> None:
     option("--token", metavar="FILE", help="file with the secret that a client has to send")
     option("--profile", metavar="P.npz", help="calibrated robot, of all clients")
     option("--engine", **ENGINE)
+    option("--confirm-s", **CONFIRM)
     streams = whole(1, 10_000, "a number of streams, 1 or more")
     option("--streams", type=streams, metavar="N", help="clients at a time (default: 4 a core)")
 
@@ -305,6 +318,7 @@ def _ros2(commands: argparse._SubParsersAction) -> None:
     option("--human", default="/human", metavar="TOPIC", help="topic for the human (default: %(default)s)")
     option("--profile", metavar="P.npz", help="calibrated robot")
     option("--engine", **ENGINE)
+    option("--confirm-s", **CONFIRM)
     told = "domain of DDS (default: ROS_DOMAIN_ID, or 0)"
     option("--domain", type=whole(0, 232, "a domain, 0 to 232"), metavar="N", help=told)
     _form(option)

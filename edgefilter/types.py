@@ -68,7 +68,7 @@ class Output(NamedTuple):
     speech_probability: float | None = None
 
 
-_Speech: TypeAlias = Literal["speech_started", "speech_stopped"]
+_Speech: TypeAlias = Literal["speech_suspected", "speech_dismissed", "speech_started", "speech_stopped"]
 _Filter: TypeAlias = Literal["realigned", "overloaded", "stepped_down", "stepped_up", "learned", "unlearned"]
 _SetUp: TypeAlias = Literal[
     "reference_missing",
@@ -105,7 +105,8 @@ class Event:
     ----------
     kind : str
         What happened. "realigned": the reference was found elsewhere in the microphone. "speech_started",
-        "speech_stopped": of the human, from engines that judge it. "overloaded", "stepped_down", "stepped_up": what too
+        "speech_stopped": of the human, from engines that judge it; "speech_suspected", some hops before most beginnings,
+        which "speech_dismissed" takes back where nobody spoke. "overloaded", "stepped_down", "stepped_up": what too
         little or enough time led to. "learned", "unlearned": a better echo path was taken over, or given back.
         "reference_missing", "reference_late", "robot_unfound": the reference was silent from the start or fell silent while
         the robot is heard, comes after its echo, or carries sound that is not found in the microphone, though that is

@@ -1,7 +1,7 @@
 """Is the probability of speech one? The centre and slope that make it so, and what is noticed at which price.
 
 Robots alone and humans laid on them (--real, without a profile), and simulated conversations with theirs, as they are
-and less the human. EDGEFILTER_CRNN=FILE.onnx names a network other than the package's. Of each hop: the averaged
+and less the human. EDGEFILTER_CRNN=FILE.onnx names a network other than the package's. Of each hop: the
 log-odds that edgefilter/filter/barge_in.py weighs, and whether the human sounds. A logistic of both is fitted (Platt
 1999), a human in one hop of four; the page says which CENTRE and SLOPE it has, how far the probability is from the share
 of humans before and after, and for each threshold false starts an hour against humans noticed. Where the fitted
@@ -22,7 +22,7 @@ from scipy.special import expit, logit
 from bench import metrics, recordings, results, systems
 from bench.metrics import FRAME, IN_TIME_S, THRESHOLDS
 from bench.recordings import Cells, Signals, progress
-from edgefilter.filter.barge_in import CENTRE, CENTRE_CALIBRATED, SLOPE, BargeInSettings
+from edgefilter.filter.barge_in import CENTRE, SLOPE, BargeInSettings
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Event, Samples
 
@@ -41,7 +41,7 @@ FINE = tuple(round(0.5 + 0.01 * step, 2) for step in range(50))
 
 
 class Listened(NamedTuple):
-    """What was heard. odds: averaged log-odds after each hop of so many samples; human: whether one sounds in it; ser: of a laid human, dB.
+    """What was heard. odds: log-odds of each hop of so many samples; human: whether one sounds in it; ser: of a laid human, dB.
 
     audible: whether the human comes within AUDIBLE_DB of the loudest sound in time to be noticed.
     """
@@ -58,9 +58,8 @@ class Listened(NamedTuple):
 def listened(kind: str, signals: Signals, profile: Profile | None) -> Listened:
     """What the network made of a recording, hop by hop; nobody speaks where signals hold no human."""
     heard = systems.run_engine(systems.Row(ENGINE, profile is not None, False), signals, profile)
-    centre = CENTRE if profile is None else CENTRE_CALIBRATED
     said = np.array((heard.probability or [])[: signals.mic.size // heard.hop])
-    odds = logit(np.clip(said, SURE, 1 - SURE)) / SLOPE + centre
+    odds = logit(np.clip(said, SURE, 1 - SURE)) / SLOPE + CENTRE
     if signals.human is None:
         return Listened(kind, odds, np.zeros(odds.size, bool), heard.hop)
     power = metrics.frame_power(signals.human[: odds.size * heard.hop], heard.hop)
@@ -127,11 +126,11 @@ def replayed(one: Listened, centre: float, slope: float, threshold: float) -> li
     return metrics.replay(expit(slope * (one.odds - centre)).tolist(), one.hop, threshold)
 
 
-def platt(centre: float, slope: float, threshold: float, usual: float) -> dict[str, float]:
-    """Scale and bias of the network's log-odds that put the filter's threshold (usual: its centre, same slope) here."""
+def platt(centre: float, slope: float, threshold: float) -> dict[str, float]:
+    """Scale and bias of the network's log-odds that put the filter's threshold here."""
     scale = slope / SLOPE
     apart = float(logit(BargeInSettings().threshold) - logit(threshold)) / SLOPE
-    return {"scale": scale, "bias": usual + apart - scale * centre}
+    return {"scale": scale, "bias": CENTRE + apart - scale * centre}
 
 
 def reliability(chosen_ones: Sequence[Listened], centre: float, slope: float) -> dict:
@@ -193,13 +192,12 @@ def run(options: argparse.Namespace) -> str:
     found, kinds = list(streams(options)), {}
     for kind in dict.fromkeys(one.kind for one in found):
         own = [one for one in found if one.kind == kind]
-        usual = CENTRE if kind == "real" else CENTRE_CALIBRATED
         centre, slope = fitted(own)
-        before, after = reliability(own, usual, SLOPE), reliability(own, centre, slope)
+        before, after = reliability(own, CENTRE, SLOPE), reliability(own, centre, slope)
         kinds[kind] = {"centre": centre, "slope": slope, "before": before, "after": after}
-        kinds[kind] |= {"curve_before": curve(own, usual, SLOPE), "curve": curve(own, centre, slope)}
+        kinds[kind] |= {"curve_before": curve(own, CENTRE, SLOPE), "curve": curve(own, centre, slope)}
         kinds[kind]["threshold"] = sparing(own, centre, slope, options.false_starts)
-        kinds[kind] |= platt(centre, slope, kinds[kind]["threshold"], usual)
+        kinds[kind] |= platt(centre, slope, kinds[kind]["threshold"])
         humans = told(own)
         kinds[kind] |= {"humans": len(humans), "audible": sum(one.audible for one in humans)}
     notes = f"Of {ENGINE}'s network; a human in one hop of {1 / HUMAN_SHARE:.0f}."

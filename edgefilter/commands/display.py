@@ -35,7 +35,7 @@ TOLD = (
     *("stepped_down", "stepped_up", "overloaded", "learned", "unlearned", "device_gone", "device_back"),
     *SET_UP_WRONG,
 )
-"""Kinds of events that are shown in every run; those of the human's speech only in a live one."""
+"""Kinds of events that are shown in every run; the beginning and end of the human's speech only in a live one."""
 STATUS_LEGEND = """\
 The status line of a live run:
   mic, robot, out    level of microphone, reference and output, dB of full scale
@@ -108,8 +108,8 @@ def interject(text: str) -> None:
 
 
 def say_event(event: Event, live: bool) -> None:
-    """Show an event when it happens if it is of a kind in TOLD or, live, about the human's speech."""
-    if event.kind in TOLD or (live and event.kind.startswith("speech")):
+    """Show an event when it happens if it is of a kind in TOLD or, live, the beginning or end of the human's speech."""
+    if event.kind in TOLD or (live and event.kind in ("speech_started", "speech_stopped")):
         interject(f"{event.sample / SAMPLE_RATE:.1f} s: {event.kind.replace('_', ' ')} {event.detail}")
 
 

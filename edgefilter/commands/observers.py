@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
@@ -23,11 +23,11 @@ from edgefilter.audio.port import SpokenReference
 from edgefilter.audio.protocols import Source
 from edgefilter.commands.display import display, interject, say_event, write_json
 from edgefilter.errors import AudioFileError, EdgefilterError
-from edgefilter.filter.barge_in import INTERRUPTIONS
+from edgefilter.filter.barge_in import INTERRUPTIONS, SUSPICIONS
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.profile.data import Profile
 from edgefilter.session import Progress
-from edgefilter.types import SAMPLE_RATE, Event
+from edgefilter.types import SAMPLE_RATE, Event, EventKind
 
 ENDED = ("samples_in", "samples_out", "samples_lost", "interrupted", "failure", "alignment", "learning", "deadline")
 """Figures of the run that the last line of a log holds."""
@@ -124,24 +124,25 @@ class TurnWriter:
             self.written += 1
 
 
-class BargeInCommand:
-    """Runs a shell command at each interruption, in a thread of its own, so that the sound does not wait for it.
+class EventCommand:
+    """Runs a shell command at each event of some kinds, in a thread of its own, so that the sound does not wait for it.
 
     The command finds what happened in EDGEFILTER_EVENT, EDGEFILTER_TIME (seconds of the microphone) and
-    EDGEFILTER_DETAIL. What it prints goes to standard error. Whatever goes wrong is one line, given to say.
+    EDGEFILTER_DETAIL. What it prints goes to standard error. Whatever goes wrong is one line, given to say, that
+    begins with the option.
     """
 
-    def __init__(self, command: str, say: Callable[[str], None]) -> None:
-        self._command, self._say = command, say
+    def __init__(self, option: str, kinds: Container[EventKind], command: str, say: Callable[[str], None]) -> None:
+        self._option, self._kinds, self._command, self._say = option, kinds, command, say
         self._threads: list[threading.Thread] = []
         self._running: set[subprocess.Popen[bytes]] = set()
 
-    def __enter__(self) -> BargeInCommand:
+    def __enter__(self) -> EventCommand:
         return self
 
     def hear(self, event: Event) -> None:
-        """Start the command if the event is an interruption."""
-        if event.kind not in INTERRUPTIONS:
+        """Start the command if the event is of those kinds."""
+        if event.kind not in self._kinds:
             return
         self._threads = [thread for thread in self._threads if thread.is_alive()]
         if len(self._threads) >= MOST_AT_ONCE:
@@ -172,7 +173,7 @@ class BargeInCommand:
             self._complain(f"ended with {code}")
 
     def _complain(self, what: str) -> None:
-        self._say(f"--on-barge-in: {what}: {self._command}")
+        self._say(f"{self._option}: {what}: {self._command}")
 
     def __exit__(self, *exc: object) -> None:
         """Wait a little for the commands that still run, then end them."""
@@ -256,9 +257,11 @@ def observing(
     with ExitStack() as stack:
         if args.barge_in and speech:
             told.of_events.append(partial(lower, speech, args.barge_in))
-        if args.on_barge_in:
-            told.of_events.append(stack.enter_context(BargeInCommand(args.on_barge_in, interject)).hear)
-        if args.barge_in or args.on_barge_in:
+        commands = ("--on-barge-in", INTERRUPTIONS, args.on_barge_in), ("--on-suspicion", SUSPICIONS, args.on_suspicion)
+        for option, kinds, command in commands:
+            if command:
+                told.of_events.append(stack.enter_context(EventCommand(option, kinds, command, interject)).hear)
+        if args.barge_in or args.on_barge_in or args.on_suspicion:
             told.of_blocks.append(Availability(ego, interject).show)
         if args.record:
             told.record = Record(args.record, ego.profile, source.microphones)

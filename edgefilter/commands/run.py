@@ -23,6 +23,7 @@ from edgefilter.commands.observers import Observers, observing
 from edgefilter.commands.signals import on_signal
 from edgefilter.engines import HAVE_LINEAR_STAGE
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
+from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.budget import DEFAULT_MS, Choice, allowed_cores, choose, forget
 from edgefilter.filter.echo_path import Learner
 from edgefilter.filter.ego_filter import EgoFilter
@@ -195,7 +196,8 @@ def make_filter(args: argparse.Namespace, live: bool, profile: Profile | None) -
         choice = choose(budget_ms or DEFAULT_MS, profile, say=say)
         engine, reason, budget_ms = choice.engine, choice.reason, choice.budget_ms
     learner = make_learner(args, live, profile)
-    ego = EgoFilter(profile, engine, budget_ms if live else None, reason, args.model, learn=learner)
+    budget_ms, barge_in = budget_ms if live else None, BargeInSettings(confirm_s=args.confirm_s)
+    ego = EgoFilter(profile, engine, budget_ms, reason, args.model, barge_in, learner)
     if profile is None and ego.engine_name in HAVE_LINEAR_STAGE:
         say(
             "no profile: the robot is not calibrated, loudspeaker and room are learned from its first seconds"

@@ -38,7 +38,8 @@ def main(args: argparse.Namespace) -> None:
 
     def make_filter(learns: bool) -> EgoFilter:
         learner = BackgroundLearner(profile) if learns else None
-        return EgoFilter(profile, args.engine, barge_in=BargeInSettings(judge="network"), learn=learner)
+        settings = BargeInSettings(judge="network", confirm_s=args.confirm_s)
+        return EgoFilter(profile, args.engine, barge_in=settings, learn=learner)
 
     make_filter(False)  # what cannot be made is said now, and what is slow to load is loaded
 

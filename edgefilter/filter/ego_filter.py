@@ -54,6 +54,10 @@ class EgoFilter:
         lost, the next `process` or `flush` returns those of this block as well.
     keep_channels : bool
         Keep the output of the linear stage for each microphone channel, for `robot_removed`.
+    on_suspicion : callable, optional
+        Called in the same way with "speech_suspected", some 50 ms before a human's speech counts as begun, and with
+        "speech_dismissed" where nobody spoke, 0.3 s later at most (`BargeInSettings.confirm_s`): a robot may lower its
+        voice meanwhile.
 
     Attributes
     ----------
@@ -99,6 +103,7 @@ class EgoFilter:
         learn: Learner | None = None,
         on_barge_in: Callable[[Event], object] | None = None,
         keep_channels: bool = False,
+        on_suspicion: Callable[[Event], object] | None = None,
     ) -> None:
         if engine == "auto" and model is not None:
             raise UsageError(
@@ -121,7 +126,8 @@ class EgoFilter:
             else:
                 ladder = Ladder(climbable(best, self.profile))
         stepping = Stepping(best.stft.hop, ladder, budget_ms)
-        self._stream = Stream(ladder or best, self.profile, stepping, barge_in, learn, on_barge_in, keep_channels)
+        hooks = on_barge_in, keep_channels, on_suspicion
+        self._stream = Stream(ladder or best, self.profile, stepping, barge_in, learn, *hooks)
 
     @property
     def _engines(self) -> Sequence[Engine | ClipEngine]:
@@ -155,7 +161,7 @@ class EgoFilter:
 
     @property
     def speech_probability(self) -> float | None:
-        """Probability that the human speaks now, 0 to 1: the network's, smoothed over a hop or two.
+        """Probability that the human speaks now, 0 to 1: what the network says of the latest hop, calibrated.
 
         None before the first hop and with engines that do not judge it: all but crnn, unless the settings of barge-in
         have judge="network"; they give no events of speech either. 0 while nothing tells a human from the robot, whose

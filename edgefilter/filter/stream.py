@@ -13,7 +13,7 @@ from edgefilter.dsp.stft import Synthesiser
 from edgefilter.engines.base import ClipEngine, Engine, EngineState
 from edgefilter.engines.spectral_subtraction import FLOOR
 from edgefilter.errors import SignalError
-from edgefilter.filter.barge_in import INTERRUPTIONS, BargeIn, BargeInSettings, HumanJudge
+from edgefilter.filter.barge_in import INTERRUPTIONS, SUSPICIONS, BargeIn, BargeInSettings, human_probability
 from edgefilter.filter.echo_path import Learner
 from edgefilter.filter.front_end import FrontEnd
 from edgefilter.filter.reference_watch import ReferenceWatch
@@ -28,7 +28,7 @@ class Stream:
 
     `EgoFilter` says what process, flush, robot_removed and the properties give. With an engine that waits for the end,
     process returns nothing and flush everything. stepping: told the compute time of every hop; what it answers becomes an
-    event. barge_in, learner, on_barge_in, keep_channels: as of `EgoFilter`.
+    event. barge_in, learner, on_barge_in, keep_channels, on_suspicion: as of `EgoFilter`.
     """
 
     def __init__(
@@ -40,10 +40,12 @@ class Stream:
         learner: Learner | None = None,
         on_barge_in: Callable[[Event], object] | None = None,
         keep_channels: bool = False,
+        on_suspicion: Callable[[Event], object] | None = None,
     ) -> None:
         self.engine, self.profile = engine, profile
         self.stepping, self.learner = stepping, learner
-        self._barge_in_settings, self._on_barge_in = barge_in, on_barge_in
+        self._barge_in_settings = barge_in
+        self._called = {**dict.fromkeys(INTERRUPTIONS, on_barge_in), **dict.fromkeys(SUSPICIONS, on_suspicion)}
         self._keep_channels = keep_channels
         self.reset()
 
@@ -62,7 +64,6 @@ class Stream:
         self._watch = ReferenceWatch(stft.hop, stft.bins) if self.front.linear_stage else None
         self.events: deque[Event] = deque(maxlen=1000)
         self.speech_probability: float | None = None
-        self._judge = HumanJudge(stft.hop / SAMPLE_RATE, calibrated=self.profile is not None)
         self.barge_in = BargeIn(stft.hop / SAMPLE_RATE, self._barge_in_settings)
         self._turns = Turns(stft, self.front.spatial)
         self._removed: deque[Samples] = deque(maxlen=round(LONGEST_S * SAMPLE_RATE / stft.hop))
@@ -105,8 +106,8 @@ class Stream:
         rest = self._run(np.zeros((*lead, padding.size), np.float32), padding)
         if self.engine.lookahead is None:
             rest = self._finish([self._synthesiser.push(spectrum) for spectrum in self.engine.answer(self._clip)])
-        if self.barge_in.end():
-            self._tell_of_speech("speech_stopped", "the recording has ended")
+        if talk := self.barge_in.end():
+            self._tell_of_speech(talk, "the recording has ended")
         return self._deliver(rest[:missing])
 
     def _expect(self, microphones: int | None) -> None:
@@ -128,7 +129,7 @@ class Stream:
             raise SignalError(f"{found}, expected as many to the end: call reset() before another recording")
 
     def _deliver(self, out: Samples) -> Samples:
-        """The finished samples out (n,), behind those that are kept; where on_barge_in has raised they are all kept."""
+        """The finished samples out (n,), behind those that are kept; where a callback has raised they are all kept."""
         if self._kept.size:
             out = np.concatenate((self._kept, out))
         error, self._raised = self._raised, None
@@ -200,12 +201,12 @@ class Stream:
         if probability is not None:
             suspect = at_any_lag or (self._watch is not None and self._watch.suspect)
             wait = self._watch.wait // self.engine.stft.hop if self._watch else 0
-            self.speech_probability = self._judge.step(probability, suspect)
+            self.speech_probability = 0.0 if suspect else human_probability(probability)
         if talk := self.barge_in.note(self.speech_probability, wait):
             self._tell_of_speech(talk, f"probability {self.speech_probability or 0.0:.2f}")
-            if self._on_barge_in and talk in INTERRUPTIONS:
+            if call := self._called.get(talk):
                 try:
-                    self._on_barge_in(self.events[-1])
+                    call(self.events[-1])
                 except BaseException as error:  # the rest of the block is filtered first
                     self._raised = self._raised or error
 
@@ -216,9 +217,11 @@ class Stream:
         if talk == "speech_started":
             self._turns.start(self.barge_in.waited)
             self._tell(talk, detail, sound=self._turns.recent())
-        else:
+        elif talk == "speech_stopped":
             self._tell(talk, detail, self._turns.finish(), self._turns.recent())
             drop_sound(self.events)
+        else:
+            self._tell(talk, detail)
 
     def _collect(self, frame: Frame, engine: ClipEngine) -> None:
         self._clip.append(frame)

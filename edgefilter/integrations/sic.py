@@ -41,6 +41,8 @@ def _options(words: list[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--channels", type=int, default=1, help="of the microphone's sound, interleaved")
     told = "those of them that form an array, from 0, as 0,1,2,3; otherwise the mean of all is taken"
     parser.add_argument("--mic-channels", type=numbers, help=told)
+    told = "longest time from the suspicion that the human speaks to certainty, s"
+    parser.add_argument("--confirm-s", type=float, default=BargeInSettings.confirm_s, help=told)
     return vars(parser.parse_args(words))
 
 
@@ -53,12 +55,14 @@ class HumanConf(SICConfMessage):
 
     profile: file of the calibrated robot, where the component runs. engine: as of `EgoFilter`. channels: of the
     microphone's sound, interleaved, of which a message does not tell how many it has. mic_channels: as of `Duplex`.
+    confirm_s: as of `BargeInSettings`.
     """
 
     profile: str | None = None
     engine: str | None = None
     channels: int | None = None
     mic_channels: Sequence[int] | None = None
+    confirm_s: float | None = None
 
 
 def _ears(
@@ -66,13 +70,14 @@ def _ears(
     engine: str,
     channels: int,
     mic_channels: Sequence[int] | None,
+    confirm_s: float,
     on_event: Callable[[Event], None] | None = None,
 ) -> tuple[Duplex, int]:
     """The filter for a microphone of so many channels, and their number; raises EdgefilterError where it cannot be made."""
     if channels < 1:
         raise UsageError(f"channels is {channels}, expected at least 1")
     named(mic_channels, there=channels)
-    ego = EgoFilter(profile, engine, barge_in=BargeInSettings(judge="network"))
+    ego = EgoFilter(profile, engine, barge_in=BargeInSettings(judge="network", confirm_s=confirm_s))
     return Duplex(ego, on_event=on_event, mic_channels=mic_channels), channels
 
 

@@ -497,6 +497,8 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--recogniser", help="URI of a service that makes text of speech: it gets finished turns")
     parser.add_argument("--profile", help="the calibrated robot")
     parser.add_argument("--engine", default="auto", help="one beside which the network can judge speech")
+    told = "longest time from the suspicion that the human speaks to certainty, s"
+    parser.add_argument("--confirm-s", type=float, default=BargeInSettings.confirm_s, help=told)
     parser.add_argument("--mic-uri", default=MIC_URI, help="where satellites find the microphone")
     parser.add_argument("--snd-uri", default=SND_URI, help="where satellites find the loudspeaker")
     parser.add_argument("--asr-uri", default=ASR_URI, help="where Home Assistant finds the recogniser")
@@ -513,7 +515,7 @@ def main(words: list[str] | None = None) -> int:
                     f"{option} {uri} lets other machines listen, and Wyoming knows no password: leave it out, or say --open"
                     " where every machine that reaches it may hear the microphone and speak"
                 )
-        ego = EgoFilter(args.profile, args.engine, barge_in=BargeInSettings(judge="network"))
+        ego = EgoFilter(args.profile, args.engine, barge_in=BargeInSettings(judge="network", confirm_s=args.confirm_s))
         mic_format = AudioFormat(args.mic_command_rate, 2, args.mic_command_channels)
         snd_format = AudioFormat(args.snd_command_rate, 2, args.snd_command_channels)
         more = args.stop_for_speech, args.mic_channels, args.recogniser, args.reference_channel

@@ -164,7 +164,12 @@ def test_first_sound_skips_silence_and_breath():
             {"delay_s": 0.25, "early": False},
         ),
         (
-            [("speech_started", 100), ("speech_stopped", 17000), ("speech_started", 18000)],
+            [
+                ("speech_started", 100),
+                ("speech_stopped", 17000),
+                ("speech_suspected", 17900),
+                ("speech_started", 18000),
+            ],
             {"delay_s": None, "early": True},
         ),
         ([("realigned", 17000)], {"delay_s": None, "early": False}),
@@ -177,7 +182,9 @@ def test_speech_that_was_on_already_is_not_noticed(kinds, expected):
 
 def test_the_curve_follows_the_packages_rule_at_another_threshold():
     hop = RATE // 10
-    probability = [0.7, 0.85, 0.6, 0.3, 0.3, 0.5, 0.3, 0.3, 0.3, 0.3, 0.3, 0.9]
+    probability = [0.7, 0.85, 0.99, 0.3, 0.3, 0.5, 0.3, 0.3, 0.3, 0.3, 0.3, 0.9]
     events = [(event.kind, event.sample // hop) for event in replay(probability, hop, 0.8)]
-    assert events == [("speech_started", 2), ("speech_stopped", 11), ("speech_started", 12)]
-    assert replay(probability, hop, 0.95) == []
+    assert events == [
+        *(("speech_suspected", 2), ("speech_started", 3), ("speech_stopped", 11), ("speech_suspected", 12))
+    ]
+    assert replay(probability, hop, 0.995) == []

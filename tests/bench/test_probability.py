@@ -48,10 +48,10 @@ def test_scale_and_bias_bring_the_threshold_of_so_many_false_starts_to_the_filte
     one, none = (sparing([alone, known], 1.0, 1.2, false_starts) for false_starts in (1, 0))
     assert expit(1.2 * (2.0 - 1.0)) < one < expit(1.2 * (2.0 - 1.0)) + 0.01
     assert expit(1.2 * (3.0 - 1.0)) < none < expit(1.2 * (3.0 - 1.0)) + 0.01
-    by = platt(1.0, 1.2, one, CENTRE)
+    by = platt(1.0, 1.2, one)
     for odds, stops in ((2.0, False), (3.0, True)):
         assert (expit(SLOPE * (by["scale"] * odds + by["bias"] - CENTRE)) > BargeInSettings().threshold) == stops
-    same = platt(CENTRE, SLOPE, BargeInSettings().threshold, CENTRE)
+    same = platt(CENTRE, SLOPE, BargeInSettings().threshold)
     assert same == pytest.approx({"scale": 1.0, "bias": 0.0})
 
 
@@ -71,14 +71,14 @@ def test_the_curve_counts_false_starts_an_hour_and_who_is_noticed(known):
         "centre": 1.0,
         "slope": 1.2,
         "threshold": 0.97,
-        **platt(1.0, 1.2, 0.97, 3.25),
+        **platt(1.0, 1.2, 0.97),
         "before": reliability([human], 3, 1),
         "after": reliability([human], 1, 1),
     }
     as_it_is = curve([alone, human, late], 3.25, 1.25)
     curves = {"curve_before": as_it_is, "curve": list(points.values())}
     fits, _, by_threshold = tables({"real": {**found, **curves, "humans": 2, "audible": 1}})
-    assert [results.cell(x, 2) for x in fits["rows"][0][:6]] == ["real", "1.00", "1.20", "0.97", "0.96", "2.29"]
+    assert [results.cell(x, 2) for x in fits["rows"][0][:6]] == ["real", "1.00", "1.20", "0.97", "0.96", "2.54"]
     assert [results.cell(x, 0) for x in by_threshold["rows"][1][1:]] == ["0", "50", "2", "50"]
     assert by_threshold["text"].startswith("Of 2 humans 1 can be noticed so soon")
 

@@ -13,25 +13,34 @@ import soundfile
 from edgefilter import EgoFilter
 from edgefilter.cli import main
 from edgefilter.commands import observers
-from edgefilter.commands.observers import Availability, BargeInCommand, lower
+from edgefilter.commands.observers import Availability, EventCommand, lower
+from edgefilter.filter.barge_in import INTERRUPTIONS, SUSPICIONS
 from edgefilter.session import Progress
 from edgefilter.types import Event
 
 STARTED, STOPPED = (Event(f"speech_{word}", 24000, "probability 0.98") for word in ("started", "stopped"))
 
 
-def test_the_command_is_run_once_for_each_interruption_and_told_what_happened(tmp_path):
+SUSPECTED, DISMISSED = (Event(f"speech_{word}", 24000, "probability 0.98") for word in ("suspected", "dismissed"))
+
+
+@pytest.mark.parametrize(
+    ("kinds", "told"),
+    [(INTERRUPTIONS, ["started", "started"]), (SUSPICIONS, ["suspected", "dismissed"])],
+)
+def test_the_command_is_run_once_for_each_event_of_its_kinds_and_told_what_happened(kinds, told, tmp_path):
     said, file = [], tmp_path / "told"
     command = f'echo "$EDGEFILTER_EVENT $EDGEFILTER_TIME $EDGEFILTER_DETAIL" >> {file}; cat >> {file}'
-    with BargeInCommand(command, said.append) as reaction:
-        for event in (STARTED, STOPPED, Event("realigned", 0, ""), STARTED):
+    with EventCommand("--on-barge-in", kinds, command, said.append) as reaction:
+        for event in (SUSPECTED, STARTED, STOPPED, Event("realigned", 0, ""), DISMISSED, STARTED):
             reaction.hear(event)
-    assert file.read_text() == "speech_started 1.500 probability 0.98\n" * 2 and not said
+    lines = file.read_text().splitlines()
+    assert sorted(lines) == sorted(f"speech_{word} 1.500 probability 0.98" for word in told) and not said
 
 
 def test_the_sound_does_not_wait_for_the_command_and_what_it_prints_is_no_sound(capfd):
     began = time.monotonic()
-    with BargeInCommand("sleep 0.3; echo heard", lambda text: None) as reaction:
+    with EventCommand("--on-barge-in", INTERRUPTIONS, "sleep 0.3; echo heard", lambda text: None) as reaction:
         reaction.hear(STARTED)
         assert time.monotonic() - began < 0.2
     out, err = capfd.readouterr()
@@ -41,7 +50,7 @@ def test_the_sound_does_not_wait_for_the_command_and_what_it_prints_is_no_sound(
 @pytest.mark.parametrize(("command", "code"), [("exit 3", "ended with 3"), ("/no/such/program 2>/dev/null", "127")])
 def test_a_command_that_fails_is_one_line(command, code):
     said = []
-    with BargeInCommand(command, said.append) as reaction:
+    with EventCommand("--on-barge-in", INTERRUPTIONS, command, said.append) as reaction:
         reaction.hear(STARTED)
     assert len(said) == 1 and code in said[0] and command in said[0]
 
@@ -50,7 +59,7 @@ def test_a_command_that_does_not_end_is_killed_with_its_children_and_not_multipl
     monkeypatch.setattr(observers, "PATIENCE_S", 0.3)
     monkeypatch.setattr(observers, "MOST_AT_ONCE", 2)
     said, alive = [], tmp_path / "alive"
-    with BargeInCommand(f"(sleep 1; touch {alive}) & wait", said.append) as reaction:
+    with EventCommand("--on-barge-in", INTERRUPTIONS, f"(sleep 1; touch {alive}) & wait", said.append) as reaction:
         for _ in range(3):
             reaction.hear(STARTED)
         time.sleep(0.2)
@@ -121,7 +130,7 @@ def test_a_machine_that_starts_no_more_threads_is_one_line_and_the_sound_goes_on
         raise RuntimeError("can't start new thread")
 
     said = []
-    with BargeInCommand("true", said.append) as reaction:
+    with EventCommand("--on-barge-in", INTERRUPTIONS, "true", said.append) as reaction:
         monkeypatch.setattr(threading.Thread, "start", refuse)
         reaction.hear(STARTED)
         monkeypatch.undo()

@@ -9,7 +9,7 @@ import soundfile
 from edgefilter import EgoFilter
 from edgefilter.commands.display import say_event
 from edgefilter.errors import UsageError
-from edgefilter.filter.barge_in import BargeIn, BargeInSettings, HumanJudge
+from edgefilter.filter.barge_in import ERROR, BargeIn, BargeInSettings, human_probability, log_odds
 from edgefilter.filter.budget import DEMO
 from edgefilter.types import SAMPLE_RATE, Event
 
@@ -29,23 +29,46 @@ def noted(probabilities: list[float | None], settings: BargeInSettings | None = 
     return [talk.note(probability) for probability in probabilities]
 
 
-def test_a_moment_is_not_speech_and_a_pause_is_not_its_end():
-    settings = BargeInSettings(threshold=0.9, release=0.5, min_speech_s=3 * HOP_S, min_silence_s=30 * HOP_S)
-    assert not any(noted([0.9, 0.9, 0.1, 0.9, 0.9] + [None] * 100, settings))
-    found = noted([0.9] * 3 + [0.49] * 29 + [0.5] + [0.49] * 30, settings)
-    happened = [(at, what) for at, what in enumerate(found) if what]
-    assert happened == [(2, "speech_started"), (len(found) - 1, "speech_stopped")]
+def happened(probabilities: list[float | None], settings: BargeInSettings | None = None) -> list[tuple[int, str]]:
+    return [(at, what) for at, what in enumerate(noted(probabilities, settings)) if what]
 
 
-def test_an_engine_that_stops_judging_ends_the_speech():
-    found = noted([1.0] * 3 + [None] * 100)
-    assert [what for what in found if what] == ["speech_started", "speech_stopped"]
+def test_a_moment_is_suspected_and_dismissed_and_a_pause_is_not_the_end_of_speech():
+    settings = BargeInSettings(threshold=0.9, release=0.5, min_silence_s=30 * HOP_S)
+    assert happened([0.95, 0.9, 0.1, *[None] * 100], settings) == [(0, "speech_suspected"), (2, "speech_dismissed")]
+    assert happened([0.95] * 2 + [0.98] + [0.49] * 29 + [0.5] + [0.49] * 30, settings) == [
+        *((0, "speech_suspected"), (2, "speech_started"), (62, "speech_stopped"))
+    ]
+
+
+def test_what_stays_unclear_is_decided_by_its_sum_when_the_time_to_confirm_is_over():
+    longest = round(0.3 / HOP_S)
+    for then, what in ((0.968, "speech_dismissed"), (0.972, "speech_started")):
+        found = happened([0.97, *[then] * longest])
+        assert found[:2] == [(0, "speech_suspected"), (longest - 1, what)]
+
+
+@pytest.mark.parametrize("sure", [0.98, 0.99, 0.999])
+def test_without_a_time_to_confirm_the_suspicion_is_the_only_event_and_comes_as_soon(sure):
+    said = [0.5, sure, sure, *[0.0] * 100]
+    found = happened(said, BargeInSettings(confirm_s=0.0))
+    assert [what for _, what in found] == ["speech_started", "speech_stopped"]
+    assert found[0][0] == happened(said)[0][0] == 1
+
+
+@pytest.mark.parametrize(("human", "right"), [(True, "speech_started"), (False, "speech_dismissed")])
+def test_of_independent_hops_with_true_odds_no_more_are_decided_wrongly_than_is_stated(human, right):
+    odds = np.random.default_rng(0).normal(1.0 if human else -1.0, np.sqrt(2.0), (4000, 18)) + log_odds(THRESHOLD)
+    decided = [happened([THRESHOLD, *said])[1] for said in (1.0 / (1.0 + np.exp(-odds))).tolist()]
+    assert np.mean([what != right for _, what in decided]) <= 2 * ERROR
+    assert np.median([hop for hop, _ in decided]) < 10
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"min_speech_s": -1.0}, "min_speech_s -1.0 and min_silence_s 0.5, expected seconds"),
+        ({"confirm_s": -1.0}, "confirm_s -1.0 and min_silence_s 0.5, expected seconds"),
+        ({"confirm_s": float("inf")}, "confirm_s inf"),
         ({"threshold": 1.0}, "release 0.4 and threshold 1.0, expected probabilities"),
         ({"release": 0.98}, "release 0.98 and threshold 0.97"),
         ({"release": 0.0}, "release 0.0"),
@@ -59,35 +82,14 @@ def test_settings_that_mean_nothing_are_one_line(settings, message):
         BargeInSettings(**settings)
 
 
-def judged(said: list[float], calibrated: bool = False) -> list[float]:
-    """What a fresh judge makes of the network's probabilities, of which the first 100 are unsure."""
-    judge = HumanJudge(HOP_S, calibrated)
-    for _ in range(100):
-        judge.step(UNSURE)
-    return [judge.step(probability) for probability in said]
-
-
-def test_one_sure_hop_does_not_interrupt_a_robot_that_nobody_calibrated():
-    cold, warm = judged([1.0] * 3), judged([1.0] * 3, calibrated=True)
-    assert cold[0] < THRESHOLD < warm[0]
-    assert cold[2] > THRESHOLD
-    assert max(judged([UNSURE] * 100)) < 0.1
+def test_one_sure_hop_interrupts_no_robot():
+    assert happened([UNSURE] * 9 + [1.0] + [UNSURE] * 9) == [(9, "speech_suspected"), (10, "speech_dismissed")]
 
 
 def test_who_interrupts_again_and_again_is_noticed_each_time_as_soon():
-    judge, delays = HumanJudge(HOP_S, False), []
-    for _ in range(12):
-        for _ in range(125):
-            judge.step(UNSURE)
-        said = [judge.step(0.9985) for _ in range(60)]
-        delays.append(next(hop for hop, probability in enumerate(said) if probability > THRESHOLD))
-    assert max(delays) < 6
-
-
-def test_what_may_be_an_utterance_that_is_not_found_yet_is_nobody_and_leaves_nothing_behind():
-    judge = HumanJudge(HOP_S, False)
-    assert [judge.step(1.0, suspect=True) for _ in range(30)] == [0.0] * 30
-    assert judge.step(UNSURE) < 0.1
+    pause, words = [human_probability(UNSURE)] * 125, [human_probability(0.9995)] * 60
+    begins = [at for at, what in happened([*pause, *words] * 12) if what == "speech_started"]
+    assert [at % 185 - 125 for at in begins] == [begins[0] - 125] * 12 and begins[0] - 125 < 5
 
 
 @pytest.mark.slow
@@ -107,7 +109,7 @@ def test_the_first_sounds_of_a_robot_whose_lag_is_not_found_yet_are_nobody(calib
 
 @pytest.mark.parametrize("probability", [0.0, 1e-30, 1.0])
 def test_probabilities_stay_in_0_to_1_whatever_comes(probability):
-    assert all(0.0 <= answer <= 1.0 for answer in judged([probability] * 40))
+    assert 0.0 <= human_probability(probability) <= 1.0
 
 
 def test_an_engine_without_a_network_gives_no_probability_and_no_events():
@@ -151,16 +153,23 @@ def test_engines_that_take_other_frames_cannot_judge_for_one_another():
 
 
 @pytest.mark.slow
-def test_the_settings_reach_the_stream_and_who_gives_a_callback_is_called_when_the_human_begins():
+def test_who_gives_callbacks_is_called_at_the_suspicion_and_at_the_beginning_and_the_settings_reach_the_stream():
     mic, ref = interrupted()
-    found = []
-    for settings in (BargeInSettings(min_speech_s=0.2), BargeInSettings()):
-        called: list[Event] = []
-        ego = EgoFilter(DEMO / "profile.npz", engine="crnn", barge_in=settings, on_barge_in=called.append)
+    found = {}
+    for confirm_s in (0.3, 0.0):
+        begun: list[Event] = []
+        suspected: list[Event] = []
+        settings = BargeInSettings(confirm_s=confirm_s)
+        ego = EgoFilter(
+            *(DEMO / "profile.npz", "crnn"), barge_in=settings, on_barge_in=begun.append, on_suspicion=suspected.append
+        )
         ego.process(mic, ref)
-        assert called and called == [event for event in ego.events() if event.kind == "speech_started"]
-        found.append(called[0].sample)
-    assert found[0] >= found[1] + 0.15 * SAMPLE_RATE
+        events = ego.events()
+        assert begun and begun == [event for event in events if event.kind == "speech_started"]
+        assert suspected == [event for event in events if event.kind in ("speech_suspected", "speech_dismissed")]
+        found[confirm_s] = begun[0].sample, suspected
+    assert not found[0.0][1] and found[0.3][1][0].sample == found[0.0][0]
+    assert 0 < found[0.3][0] - found[0.0][0] < 0.3 * SAMPLE_RATE
 
 
 @pytest.mark.slow
@@ -198,7 +207,8 @@ def test_in_the_demo_the_human_is_noticed_and_the_robot_is_not(alone):
     if alone:
         assert not talk and not ego.human_speaks
         return
-    assert [event.kind for event in talk] == ["speech_started", "speech_stopped"]
+    assert [event.kind for event in talk] == ["speech_suspected", "speech_started", "speech_stopped"]
+    talk = talk[1:]
     power = np.square(human[: human.size // 320 * 320]).reshape(-1, 320).mean(1)
     first, last = np.flatnonzero(power > 10**-2.5 * power.max())[[0, -1]] * 320
     assert first < talk[0].sample < first + 0.5 * SAMPLE_RATE
@@ -224,30 +234,24 @@ def test_a_human_beside_a_robot_that_plays_unheard_is_noticed_at_once():
     assert len(noticed) == 1 and 0 <= noticed[0] - begins < SAMPLE_RATE // 4
 
 
-@pytest.mark.parametrize(("calibrated", "unlikely"), [(False, 0.0036), (True, 0.00075)])
-def test_however_long_it_was_sure_the_network_is_heard_when_it_changes_its_mind(calibrated, unlikely):
-    """No second of certainty is more than the odds of one bounded hop: the rest would have to be outweighed."""
-    judge = HumanJudge(HOP_S, calibrated)
-    assert 1.0 - [judge.step(1.0) for _ in range(60)][-1] == pytest.approx(unlikely, rel=0.05)
-    said = [judge.step(0.0) for _ in range(60)]
-    assert said[2] < 0.5 and said[-1] == pytest.approx(0.00103 if not calibrated else 0.0049, rel=0.05)
-
-
 def test_without_a_least_silence_the_first_silent_hop_ends_the_speech():
-    assert noted([0.99, 0.0, 0.99], BargeInSettings(min_silence_s=0.0)) == [
+    assert noted([0.99, 0.0, 0.99], BargeInSettings(confirm_s=0.0, min_silence_s=0.0)) == [
         *("speech_started", "speech_stopped", "speech_started")
     ]
 
 
 def test_at_the_end_of_a_recording_speech_is_over_and_the_next_begins_anew():
-    talk = BargeIn(HOP_S, BargeInSettings(min_speech_s=2 * HOP_S, min_silence_s=2 * HOP_S))
-    assert [talk.note(0.99) for _ in range(2)] == [None, "speech_started"]
-    assert talk.end() is True and not talk.speaking and talk.end() is False
-    assert [talk.note(each) for each in (0.99, 0.99, 0.0, 0.0)] == [None, "speech_started", None, "speech_stopped"]
+    talk = BargeIn(HOP_S, BargeInSettings(min_silence_s=2 * HOP_S))
+    assert [talk.note(0.9999) for _ in range(2)] == ["speech_suspected", "speech_started"]
+    assert talk.end() == "speech_stopped" and not talk.speaking and talk.end() is None
+    assert talk.note(0.99) == "speech_suspected" and talk.end() == "speech_dismissed"
+    assert [talk.note(each) for each in (0.9999, 0.9999, 0.0, 0.0)] == [
+        *("speech_suspected", "speech_started", None, "speech_stopped")
+    ]
 
 
 def test_how_long_a_beginning_was_not_told_is_known_when_it_is():
     talk = BargeIn(HOP_S)
-    assert [talk.note(0.99, wait=3) for _ in range(4)][-1] == "speech_started" and talk.waited == 3
+    assert [talk.note(0.9999, wait=3) for _ in range(4)][-1] == "speech_started" and talk.waited == 3
     talk.end()
-    assert talk.note(0.99) == "speech_started" and talk.waited == 0
+    assert [talk.note(0.9999) for _ in range(2)][-1] == "speech_started" and talk.waited == 1

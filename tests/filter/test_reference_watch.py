@@ -158,10 +158,10 @@ def test_a_reference_that_never_comes_is_said_once_where_something_is_heard(leve
 
 def test_speech_that_waits_is_told_once_it_may_be_and_never_if_it_has_ended():
     talk = BargeIn(0.1)
-    assert [talk.note(0.99, wait=3) for _ in range(5)] == [None, None, None, "speech_started", None]
+    assert [talk.note(0.999, wait=3) for _ in range(5)] == [None, None, None, "speech_started", None]
     assert [talk.note(0.0, wait=3) for _ in range(6)].count("speech_stopped") == 1
-    assert [talk.note(p, wait=30) for p in (0.99, *[0.0] * 6, 0.5)] == [None] * 8 and not talk.speaking
-    assert talk.note(0.99, wait=0) == "speech_started"
+    assert [talk.note(p, wait=30) for p in (*[0.999] * 2, *[0.0] * 6, 0.5)] == [None] * 9 and not talk.speaking
+    assert talk.note(0.999, wait=0) == "speech_suspected"
 
 
 def test_a_microphone_that_is_processed_is_said_and_a_good_one_is_not(robot):
