@@ -15,6 +15,7 @@ from edgefilter import Profile, enhance
 from edgefilter.dsp.psd import floored
 from edgefilter.echo.effect import RECORDING, complete, neutral
 from edgefilter.echo.effects import catalogue
+from edgefilter.echo.effects.free_laws import FreeCurve
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.running import SourceChain, reach, stream_form
@@ -388,6 +389,8 @@ def _decaying(taps: int, per: float, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).standard_normal(taps) * np.exp(-np.arange(taps) / per)
 
 
+COMPRESSED = {"loudest_db": -10.0, "gain_db": -(np.linspace(0.0, 3.5, 11) ** 2), "attack_ms": 5.0, "release_ms": 100.0}
+BENT = {"peak": 0.4, "bend": np.tanh(2.0 * FreeCurve.knots) / 2.0 - FreeCurve.knots}
 EFFECT_CASES: dict[str, dict[str, object]] = {
     "playback_gain": {"gain_db": -2.5},
     "speaker_nonlinearity": {
@@ -425,6 +428,13 @@ EFFECT_CASES: dict[str, dict[str, object]] = {
         "fan_db": 10.0 * np.log10(_fan_psd()),
         "softer_db": -20.0,
     },
+    "free_gain": COMPRESSED,
+    "free_gain_behind": COMPRESSED,
+    "free_curve": BENT,
+    "free_curve_behind": BENT,
+    "free_filter": {"taps": np.eye(256)[[32, 75]].T @ [-0.3, 0.6]},
+    "free_modulation": {"rate_hz": 4.0, "waves": np.eye(8)[[0, 5]].T @ [0.5, 0.2]},
+    "free_lag": {"lag": 1.5 * np.sin(np.arange(SECONDS + 1.0))},
     "bandlimit": {"cutoff_hz": 2500.0, "order": 6.0},
     "chassis_resonance": {"frequency_hz": 820.0, "q": 40.0, "gain_db": 0.0, "phase_deg": 30.0},
     "late_reverb": {"taps": 0.04 * _decaying(6000, 1200.0, 11)},

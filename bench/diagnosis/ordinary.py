@@ -40,11 +40,11 @@ LEVELS = (0.01, 0.05, 0.1, 0.25, 0.5)
 
 
 def gains(case: Path) -> dict[str, float]:
-    """Trial.gain_db of each effect, fitted alone; 0 where its fit finds nothing."""
+    """Trial.gain_db of each effect that a search tries, fitted alone; 0 where its fit finds nothing."""
     recorded = signals(case)
     prepared = prepare(calibrate(*map(recorded.get, CALIBRATION)), recorded["mic"], recorded["ref"])
     scorer, model = Scorer(prepared), prepared.model
-    base, found = scorer.of(model), dict.fromkeys(names(), 0.0)
+    base, found = scorer.of(model), {name: 0.0 for name in names() if not find(name).free}
     for name in found:
         effect = find(name)
         values = model.fitted(name, scorer.measurement)

@@ -7,23 +7,20 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from edgefilter.diagnosis.criteria import Criteria
-from edgefilter.diagnosis.independence import PER_MS
 from edgefilter.diagnosis.prepare import Prepared
 from edgefilter.diagnosis.trials import Found
 from edgefilter.dsp.frames import block_power, block_sums, decibels, frames
 from edgefilter.dsp.psd import GRID_FFT, frequencies, periodograms
+from edgefilter.echo.effects.free_laws import STEP as BEAT_STEP
+from edgefilter.echo.effects.free_laws import by_rate
 from edgefilter.echo.effects.mic_agc import SURE
 from edgefilter.echo.wiener import spectra
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 STEP = SAMPLE_RATE // 50
 """Samples (20 ms) over which a gain is summed."""
-BEAT = PER_MS
-"""The same where its rate is sought."""
 TIME_S, LEVEL_DB, RATES_HZ = 0.04, 5.0, (1.0, 30.0)
 """Of one point of a curve: five in a period of a tremolo of 5 Hz; and the rates that are looked at."""
-FINER = 24
-"""Rates tried per cycle in the whole recording."""
 BANDS_HZ = np.geomspace(100.0, 7800.0, 20)
 RATE, SILENCES = "rate at which the gain comes and goes", "frequency, in the robot's silences"
 
@@ -106,7 +103,7 @@ class _Gains:
 
 
 def _over_rate(voice: Samples, left: Samples, gains: _Gains) -> Curve:
-    energy, cross = (block_sums(voice * other, BEAT) for other in (voice, voice + left))
+    energy, cross = (block_sums(voice * other, BEAT_STEP) for other in (voice, voice + left))
     if not energy.any():
         return Curve(RATE, "Hz", (), (), 0.0)
     rates, worth, depth = by_rate(energy, cross, *RATES_HZ)
@@ -114,27 +111,6 @@ def _over_rate(voice: Samples, left: Samples, gains: _Gains) -> Curve:
     place = np.digitize(rates, np.geomspace(RATES_HZ[0], rates[-1], 61))
     deepest = np.array([np.argmax(np.where(place == k, depth, -1.0)) for k in np.unique(place)])
     return Curve.of(RATE, "Hz", rates[deepest], 20.0 * np.log10(1.0 + depth[deepest]), away / max(gains.whole, 1e-9))
-
-
-def by_rate(energy: Array, cross: Array, lowest_hz: float, highest_hz: float) -> tuple[Array, Array, Array]:
-    """Of each rate (k,) in Hz the energy that a gain 1 + a cos + b sin at it explains, (k,), and its depth, (k,).
-
-    From sums of voice times voice, and voice times recording, per step.
-    """
-    size = FINER * energy.size
-    per = SAMPLE_RATE / BEAT / size
-    own, other = np.fft.rfft(energy, size), np.fft.rfft(cross, size)
-    rates = np.arange(max(round(lowest_hz / per), 1), min(round(highest_hz / per), own.size // 2))
-    at, twice, seen = own[rates], own[2 * rates], other[rates]
-    even, odd, both = 0.5 * (own[0] + twice).real, 0.5 * (own[0] - twice).real, -0.5 * twice.imag
-    whole = np.full(rates.size, own[0].real)
-    rows = ((whole, at.real, -at.imag), (at.real, even, both), (-at.imag, both, odd))
-    matrix = np.ascontiguousarray(np.moveaxis(np.array(rows), 2, 0))
-    right = np.stack((np.full(rates.size, other[0].real), seen.real, -seen.imag), axis=1)
-    matrix += (1e-6 * own[0].real + 1e-30) * np.eye(3)
-    found = np.linalg.solve(matrix, right[:, :, None])[:, :, 0]
-    depth = np.hypot(found[:, 1], found[:, 2]) / np.maximum(np.abs(found[:, 0]), 1e-6)
-    return rates * per, np.sum(found * right, axis=1), depth
 
 
 def _over_frequency(prepared: Prepared, voice: Samples, left: Samples, gains: _Gains) -> Curve:

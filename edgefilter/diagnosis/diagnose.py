@@ -14,7 +14,7 @@ from edgefilter.diagnosis.compare import Comparison, compare, describe, independ
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.findings import evidence_of, findings_of
 from edgefilter.diagnosis.joint import fit_jointly
-from edgefilter.diagnosis.laws import free_law
+from edgefilter.diagnosis.laws import law_of, with_laws
 from edgefilter.diagnosis.leftover import left_in_words, leftover
 from edgefilter.diagnosis.precision import precision
 from edgefilter.diagnosis.prepare import Prepared, prepare
@@ -96,7 +96,8 @@ def diagnose(
     """
     prepared = prepare(profile, recording, reference, sample_rate=sample_rate)
     criteria = criteria or Criteria()
-    return conclude(prepared, search(prepared, prepared.model, criteria, progress, without), criteria, progress)
+    found = search(prepared, prepared.model, criteria, progress, without)
+    return conclude(prepared, found, criteria, progress, without)
 
 
 def add(
@@ -238,10 +239,12 @@ def conclude(
     found: Found,
     criteria: Criteria,
     progress: Callable[[str], None] | None = None,
+    without: Collection[str] = (),
 ) -> Diagnosis:
-    """The diagnosis that a search leads to."""
+    """The diagnosis that a search leads to; without: names of free laws that are not tried either."""
     comparison = describe(prepared, found.start, found.base)
-    searched, left = found, leftover(found)
+    searched, found = found, with_laws(found, criteria, progress, without)
+    left = leftover(found)
     believed = bool(found.steps) and _believed(found, criteria)
     quiet = found.base.excess_db < criteria.explained_db and not prepared.human
     verdict: Verdict = "missing" if found.steps and holds(found, criteria) else "explained" if quiet else "unexplained"
@@ -266,7 +269,7 @@ def conclude(
         precision=precision(found, findings),
         advice=(*advice(tried), *asks(tried)),
         closer_look=look_closer(found) if verdict == "unexplained" else None,
-        law=free_law(found, criteria, progress) if verdict == "unexplained" else None,
+        law=law_of(found),
     )
 
 

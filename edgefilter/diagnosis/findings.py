@@ -56,6 +56,7 @@ def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[t
                 ),
                 values=step.values,
                 prediction=step.score.prediction,
+                like=found.like.get(step.name, ""),
             )
         )
         before = after
@@ -78,6 +79,8 @@ def _intervals(prepared: Prepared, model: EchoModel, step: Trial) -> tuple[Mappi
 
     Where fewer than two thirds can be fitted, a parameter may have any of its possible values.
     """
+    if not find(step.name).told:
+        return {}, []
     block = np.arange(prepared.usable.size) // BLOCK
     others = model.without_effect(step.name)
     fits, failed = [], []

@@ -63,7 +63,7 @@ class Finding:
 
     p_value: of what it explains, by itself or beside the others (diagnosis/ordinary.py). share: part of the excess power
     that it takes away, 0 to 1. values: as fitted, for EchoModel.with_effect. prediction: (n,) of the model with this and
-    all earlier findings.
+    all earlier findings. like: where the effect is the free law of a family, the listed effect that it is most like.
     """
 
     effect: str
@@ -76,6 +76,7 @@ class Finding:
     evidence: str
     values: Values = field(repr=False)
     prediction: Samples = field(repr=False)
+    like: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,6 +180,7 @@ class Diagnosis:
                 "share": round(finding.share, 4),
                 "parameters": {name: interval.to_dict() for name, interval in finding.parameters.items()},
                 "evidence": finding.evidence,
+                **({"like": finding.like} if finding.like else {}),
             }
             for finding in self.ranking
         ]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TypeAlias
 
@@ -65,7 +65,7 @@ class Found:
     """The outcome of a search from a start model.
 
     steps: the accepted effects in their order. notes: what the reader must know of the search. tried: every effect that
-    was fitted.
+    was fitted. like: of a free law the name of its family that it replaces.
     """
 
     prepared: Prepared
@@ -76,6 +76,7 @@ class Found:
     steps: tuple[Trial, ...]
     notes: tuple[str, ...] = ()
     tried: tuple[Tried, ...] = ()
+    like: Mapping[str, str] = field(default_factory=dict)
 
     @cached_property
     def in_noise(self) -> Prepared:
@@ -287,7 +288,7 @@ class Workbench:
     def absent(self, model: EchoModel, most: int) -> list[str]:
         """Names of the effects that a model has not, or as the start has them, that may be tried and whose complexity is at most `most`."""
         out = {*added(self._start, model), *self._without}
-        return [name for name in names() if name not in out and find(name).complexity <= most]
+        return [n for n in names() if n not in out and find(n).complexity <= most and not find(n).free]
 
     def less(self, model: EchoModel, name: str) -> EchoModel:
         """The model without what it has of that effect beyond the start."""

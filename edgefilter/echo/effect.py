@@ -75,7 +75,9 @@ class Effect:
     title: how it reads inside a sentence ("a turned volume"); by default the name. complexity: of two effects that
     explain about as much the lower one is named; from 4 on it is a long filter, which half a minute does not teach.
     cost: of a fit, in tenths of a second. flexible: whether it has so many numbers that it takes up what a simpler effect
-    beside it does. shown_by: recordings in which it differs from effects without them (diagnosis/advice.py).
+    beside it does. free: whether it is the law of a family
+    rather than an effect (free_laws.py): no search tries it. shown_by: recordings in which it differs from effects without
+    them (diagnosis/advice.py).
     """
 
     name: ClassVar[str]
@@ -92,6 +94,7 @@ class Effect:
     complexity: ClassVar[int] = 3
     cost: ClassVar[int] = 1
     flexible: ClassVar[bool] = False
+    free: ClassVar[bool] = False
     shown_by: ClassVar[tuple[Experiment, ...]] = ()
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
@@ -179,7 +182,7 @@ class Effect:
     @property
     def learned(self) -> bool:
         """Whether the running filter fits it anew to what it hears: the curve of a loudspeaker."""
-        return self.stage == "source" and self.family == "static nonlinearity"
+        return self.stage == "source" and self.family == "static nonlinearity" and not self.free
 
     @property
     def adds_noise(self) -> bool:

@@ -245,10 +245,10 @@ def _facts(before: Comparison, after: Comparison | None, irreducible_db: float |
 
 def _look(look: CloserLook | None, law: Law | None) -> dict[str, object] | None:
     """The curves, of the law first, as points of drawings 100 wide and 40 high; zero: the height of 0 dB."""
-    if look is None:
+    if look is None and law is None:
         return None
     drawn = []
-    for curve in (*((law.curve,) if law else ()), *look.curves):
+    for curve in (*((law.curve,) if law else ()), *(look.curves if look else ())):
         low, high = min(0.0, *curve.y_db), max(0.0, *curve.y_db)
         x = np.log(curve.x) if curve.x_unit == "Hz" else np.array(curve.x)
         across, up = max(float(x[-1] - x[0]), 1e-9), max(high - low, 1.0)
@@ -263,14 +263,14 @@ def _look(look: CloserLook | None, law: Law | None) -> dict[str, object] | None:
                 "range": f"{low:+.1f} to {high:+.1f} {curve.y_unit}".replace("-", "−"),
             }
         )
-    said = f"{text.sentence(law.words)} It leaves {text.decibels(law.excess_db)} dB." if law else ""
-    return {"sentence": text.sentence(look.sentence), "law": said, "family": law.family if law else "", "curves": drawn}
+    said = {"law": text.sentence(law.words) if law else "", "family": law.family if law else ""}
+    return {"sentence": text.sentence(look.sentence) if look else "", "curves": drawn, **said}
 
 
 def _finding(finding: Finding) -> dict[str, object]:
     """What the page says of one effect."""
     return {
-        "title": text.title(finding.effect),
+        "title": text.heading(finding),
         "effect": finding.effect,
         "before": text.decibels(finding.excess_before_db),
         "after": text.decibels(finding.excess_after_db),

@@ -140,11 +140,7 @@ def diagnosis_lines(found: Diagnosis, calibrated: bool = True) -> list[str]:
     if found.closer_look:
         lines.append(f"closer      {sentence(found.closer_look.sentence)}")
     if law := found.law:
-        beside = f" beside {joined(law.beside)}" if law.beside else ""
-        lines.append(
-            f"law         {law.family}: {law.words}; it leaves {decibels(law.excess_db)} dB{beside}; --write-effect MINE.py"
-            " writes this law as your own effect"
-        )
+        lines.append(f"law         {law.family}: {law.words}; --write-effect MINE.py writes it as your own effect")
     if found.proof or found.unproven:
         lines.append(proof_line(found.proof, found.unproven))
     lines += precision_lines(found.precision)
@@ -185,11 +181,16 @@ def coarser(times: Sequence[tuple[float, float, float]], rows: int) -> list[tupl
 def _finding(rank: int, finding: Finding) -> list[str]:
     fall = f"{decibels(finding.excess_before_db)} to {decibels(finding.excess_after_db)} dB"
     return [
-        f"{rank:>2}. {title(finding.effect)} ({finding.effect}): {fall}, {100 * finding.share:.0f} % of the excess",
+        f"{rank:>2}. {heading(finding)} ({finding.effect}): {fall}, {100 * finding.share:.0f} % of the excess",
         f"      {sentence(finding.evidence)}",
         f"      {family_line(finding)}",
         *(f"      {name} = {interval_text(interval)}" for name, interval in finding.parameters.items()),
     ]
+
+
+def heading(finding: Finding) -> str:
+    """Name a finding; a free law with the listed effect that it is most like."""
+    return title(finding.effect) + (f", most like {spoken(finding.like)}" if finding.like else "")
 
 
 def family_line(finding: Finding) -> str:

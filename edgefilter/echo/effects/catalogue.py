@@ -19,6 +19,15 @@ from edgefilter.echo.effects.delay_jump import DelayJump
 from edgefilter.echo.effects.early_path import EarlyPath
 from edgefilter.echo.effects.equaliser import Equaliser
 from edgefilter.echo.effects.fan_noise import FanNoise
+from edgefilter.echo.effects.free_laws import (
+    FreeCurve,
+    FreeCurveBehind,
+    FreeFilter,
+    FreeGain,
+    FreeGainBehind,
+    FreeLag,
+    FreeModulation,
+)
 from edgefilter.echo.effects.late_reverb import LateReverb
 from edgefilter.echo.effects.limiter import Limiter
 from edgefilter.echo.effects.mic_agc import MicAgc
@@ -39,10 +48,12 @@ EFFECTS: tuple[Effect, ...] = (
     Compression(),
     MultibandCompression(),
     Limiter(),
+    FreeGain(),
     DelayJump(),
     PacketLoss(),
     Codec(),
     SpeakerNonlinearity(),
+    FreeCurve(),
     Rattle(),
     EarlyPath(),
     LateReverb(),
@@ -50,6 +61,11 @@ EFFECTS: tuple[Effect, ...] = (
     Bandlimit(),
     Equaliser(),
     ChassisResonance(),
+    FreeFilter(),
+    FreeCurveBehind(),
+    FreeGainBehind(),
+    FreeModulation(),
+    FreeLag(),
     ClockDrift(),
     MicAgc(),
     MicClipping(),
