@@ -18,7 +18,7 @@ from edgefilter.echo.wiener import spectra
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 STEP = SAMPLE_RATE // 50
-"""Samples (20 ms) over which a gain is summed."""
+"""Samples (20 ms) over which energies are summed, of whose ratio a gain is taken."""
 TIME_S, LEVEL_DB, RATES_HZ = 0.04, 5.0, (1.0, 30.0)
 """Of one point of a curve: five in a period of a tremolo of 5 Hz; and the rates that are looked at."""
 BANDS_HZ = np.geomspace(100.0, 7800.0, 20)
@@ -140,7 +140,7 @@ def _silence(prepared: Prepared, prediction: Samples) -> Curve:
 
 
 def _middles_hz() -> Array:
-    """The middle of each of BANDS_HZ."""
+    """Centre frequency of each band between BANDS_HZ, geometric, Hz."""
     return np.sqrt(BANDS_HZ[1:] * BANDS_HZ[:-1])
 
 

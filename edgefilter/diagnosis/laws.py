@@ -205,6 +205,6 @@ def _given(effect: str, key: str) -> bool:
 
 
 def _written(value: object) -> str:
-    """Python for a number or an array."""
+    """Source text in Python of a number or an array."""
     digits = np.round(np.asarray(value, float), 5).tolist()
     return f"np.array({digits})" if isinstance(digits, list) else repr(digits)

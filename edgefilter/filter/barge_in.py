@@ -130,7 +130,7 @@ class BargeIn:
 
 
 def human_probability(probability: float) -> float:
-    """That a human speaks in a hop, 0 to 1, from what the network says.
+    """Calibrated probability that a human speaks in a hop, 0 to 1, from that of the network's head, 0 to 1.
 
     >>> [round(human_probability(said), 3) for said in (0.5, 0.97, 0.999)]
     [0.012, 0.493, 0.986]

@@ -44,7 +44,7 @@ FURTHEST = 10.0
 PRODUCT_PARTITIONS, PRODUCT_VARIANCE = 2, 2e-3
 """Length of the paths of the nonlinear products, and their variance relative to the linear path."""
 VOLUME_REOPENS = 0.02
-"""Variance of a path whose volume was turned, relative to its power: the factor is not known exactly."""
+"""Added to the variance of a path when its volume is found to be turned, relative to its power: the factor is not exact."""
 REOPEN = 0.3
 """Variance, relative to its power, of a path that is found to be another one. Of the path itself as much is kept as is
 heard: kept whole, a variance that grows with it let it grow without end."""
@@ -351,7 +351,7 @@ class Canceller:
         self._covariance += self._ageing
 
     def _expect(self, path_power: Samples, decay: Samples, known: Samples | float = 0.0) -> None:
-        """Let the covariance be that of a path of this power (bins,) at least: decay (partitions, 1) of it, and known."""
+        """Raise the covariance where it is below decay (partitions, 1) times a path's power (bins,), plus a known variance."""
         rows = self._covariance[..., : self.partitions, :], self._covariance[..., self.partitions :, :]
         expected = known + decay * path_power[..., None, :], PRODUCT_VARIANCE * path_power[..., None, :]
         for row, variance in zip(rows, expected):

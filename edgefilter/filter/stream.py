@@ -51,7 +51,7 @@ class Stream:
 
     @property
     def latency(self) -> int:
-        """Algorithmic latency in samples: the window, and the engine's look-ahead where it does not wait for the end."""
+        """Algorithmic latency in samples: the window plus the engine's look-ahead, 0 for one that waits for the recording's end."""
         return self.engine.stft.window_length + (self.engine.lookahead or 0) * self.engine.stft.hop
 
     def reset(self) -> None:
@@ -236,8 +236,8 @@ class Stream:
 def step(engine: Engine, frame: Frame, state: EngineState) -> tuple[Output, EngineState]:
     """The engine's answer and its next state.
 
-    Where the robot may arrive at any lag nothing tells it from a human: the answer is noise, of the error no more than
-    FLOOR of the noise; nobody speaks, and the engine forgets the frame.
+    While the robot's lag is unknown (frame.at_any_lag) nothing tells robot from human: the answer is then the error,
+    lowered to FLOOR times the stationary noise's amplitude, the probability of speech is 0, and the engine's state stays.
     """
     output, following = engine.step(frame, state)
     if not frame.at_any_lag:

@@ -68,7 +68,7 @@ class FreeLaw(Effect):
         return ()
 
     def drawn(self, values: Values) -> Drawn:
-        """The law as a curve."""
+        """The law as points of a curve, for a plot."""
         raise NotImplementedError
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
@@ -160,9 +160,10 @@ class FreeCurve(FreeLaw):
 
 @dataclass(frozen=True)
 class Times:
-    """Of a level: attack and release in ms, by how many ms it is heard ahead, and whether a step counts by its peak.
+    """How the level that drives a gain is smoothed.
 
-    exponent: of the power that is smoothed.
+    attack_ms, release_ms: time constants while it rises and falls. ahead_ms: look-ahead. peak: whether each STEP of samples
+    counts by its largest square, not by its mean square. exponent: the signal's power is raised to it, then smoothed.
     """
 
     attack_ms: float
@@ -463,7 +464,7 @@ def _spread(values: Values, name: str, size: int) -> Array:
 
 
 def _waves(rate_hz: float, samples: Array) -> Array:
-    """Cosines, then sines, of a rate and its multiples at those samples (n,), (2 HARMONICS, n)."""
+    """Cosines, then sines, of a rate in Hz and its multiples at the sample numbers (n,), (2 HARMONICS, n)."""
     angle = 2.0 * np.pi * rate_hz / SAMPLE_RATE * samples * np.arange(1, HARMONICS + 1)[:, None]
     return np.concatenate((np.cos(angle), np.sin(angle)))
 
@@ -473,7 +474,7 @@ def _level_knots(loudest_db: float) -> Array:
 
 
 def _levels(x: Samples, settings: Sequence[Times], before_db: float = FLOOR_DB) -> Array:
-    """Level in dB at the end of each step of x (n,), by m settings, (m, k); before_db: that before the first."""
+    """Smoothed level, dB re full scale, at the end of each of the k steps of x (n,), for m Times, (m, k); before_db: ahead of x."""
     rising, falling = (
         -np.expm1(-1.0 / np.array(ms)) for ms in zip(*((t.attack_ms, t.release_ms) for t in settings), strict=True)
     )
