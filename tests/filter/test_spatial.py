@@ -9,16 +9,19 @@ from edgefilter.dsp.stft import StftConfig
 from edgefilter.filter.spatial import (
     CARRIED,
     HUMAN_MEMORY_S,
+    LIKELY,
     LOADING,
     NOISE_MEMORY_S,
     NOISE_WEIGHT,
     PRIOR,
+    UNLIKELY,
     SpatialFilter,
     diffuse_coherence,
     solve,
 )
 
 STFT = StftConfig()
+SPEECH, UNSURE, NOISE = 0.9, (LIKELY + UNLIKELY) / 2, 0.5 * UNLIKELY
 HOP_S = STFT.hop / 16000
 PLACES = 0.04 * np.array([[1.0, 0.0, 0.0], [-0.5, 0.866, 0.0], [-0.5, -0.866, 0.0]])
 
@@ -67,13 +70,13 @@ def slow(frames: list, noise: np.ndarray) -> np.ndarray:
     for error, gain, probability, speaking, idle in frames:
         outer = np.einsum("if,jf->ijf", error, error.conj())
         against = fan if idle else robot
-        heard = speaking or probability > 0.5
+        heard = speaking or probability > LIKELY
         if heard:
             kept = (1.0 if before else CARRIED) * (1.0 - HOP_S / HUMAN_MEMORY_S)
-            human = kept * human + (gain**2 * outer if probability > 0.5 else 0.0)
-            hops = kept * hops + (probability > 0.5)
-            through = kept * through + (gain**2 if probability > 0.5 else 0.0)
-        elif probability < 0.3:
+            human = kept * human + (gain**2 * outer if probability > LIKELY else 0.0)
+            hops = kept * hops + (probability > LIKELY)
+            through = kept * through + (gain**2 if probability > LIKELY else 0.0)
+        elif probability < UNLIKELY:
             against += HOP_S / NOISE_MEMORY_S * (outer - against)
         before = heard
     weights = np.zeros(noise.shape[1:], complex)
@@ -99,7 +102,7 @@ def test_streaming_weights_are_those_of_the_slow_filter() -> None:
         fan = 0.7 * np.einsum("ijf,jf->if", root, complex_noise(rng, 3, STFT.bins))
         error = fan + (4.0 * human * complex_noise(rng, STFT.bins) if speaks else 0.0)
         gain = rng.uniform(0.2, 1.0, STFT.bins).astype(np.float32)
-        frames.append((error.astype(np.complex64), gain, 0.9 if speaks else 0.1, speaks, hop % 50 < 10))
+        frames.append((error.astype(np.complex64), gain, SPEECH if speaks else NOISE, speaks, hop % 50 < 10))
         spatial.learn(*frames[-1])
     expected = slow(frames, noise)
     assert np.abs(spatial.weights - expected).max() < 1e-3 * np.abs(expected).max()
@@ -110,7 +113,7 @@ def test_a_human_keeps_level_and_phase_and_the_fan_is_lowered() -> None:
     human, noise = plane_wave(np.array([0.8, 0.0, 0.6])), fan_below()
     spatial = SpatialFilter(STFT, 3, noise)
     for _ in range(100):
-        spatial.learn(3.0 * human * complex_noise(rng, STFT.bins), np.ones(STFT.bins, np.float32), 0.9, True, True)
+        spatial.learn(3.0 * human * complex_noise(rng, STFT.bins), np.ones(STFT.bins, np.float32), SPEECH, True, True)
     heard = spatial.step(human[None])[0][8:]
     assert np.abs(20 * np.log10(np.abs(heard))).max() < 0.5 and np.abs(np.angle(heard)).max() < 0.2
     before, after = noise[0, 0].real[8:], spatial.fan_psd()[8:]
@@ -121,7 +124,7 @@ def test_a_human_of_whom_nothing_is_known_loses_at_most_1_db() -> None:
     rng = np.random.default_rng(3)
     spatial = SpatialFilter(STFT, 3, fan_below())
     for _ in range(20):
-        spatial.learn(complex_noise(rng, 3, STFT.bins) * 0, np.zeros(STFT.bins, np.float32), 0.4, False, True)
+        spatial.learn(complex_noise(rng, 3, STFT.bins) * 0, np.zeros(STFT.bins, np.float32), UNSURE, False, True)
     powers = [np.abs(spatial.step(plane_wave(one)[None])[0][3:250]) ** 2 for one in directions(rng, 300)]
     assert 10 * np.log10(np.mean(powers)) > -1.0
     lost = -10 * np.log10(np.mean(powers, axis=1))
@@ -134,13 +137,13 @@ def test_the_noise_is_held_while_a_human_speaks() -> None:
     loud = 10 * complex_noise(rng, 3, STFT.bins)
     nothing = np.zeros(STFT.bins, np.float32)
     for _ in range(20):
-        one.learn(loud, nothing, 0.4, False, False)
+        one.learn(loud, nothing, UNSURE, False, False)
     before = one.weights
     for _ in range(50):
-        one.learn(loud, nothing, 0.2, True, False)
+        one.learn(loud, nothing, NOISE, True, False)
     still = one.weights
     for _ in range(50):
-        one.learn(loud, nothing, 0.2, False, False)
+        one.learn(loud, nothing, NOISE, False, False)
     assert np.abs(one.weights - still).max() > 10 * np.abs(still - before).max()
 
 
@@ -150,9 +153,9 @@ def test_another_direction_is_followed_within_a_turn() -> None:
     spatial, ones = SpatialFilter(STFT, 3, noise), np.ones(STFT.bins, np.float32)
     for place in ([1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]):
         human = plane_wave(np.array(place))
-        spatial.learn(np.zeros((3, STFT.bins), np.complex64), ones, 0.1, False, True)  # a turn ends
+        spatial.learn(np.zeros((3, STFT.bins), np.complex64), ones, NOISE, False, True)  # a turn ends
         for _ in range(32):  # half a second
-            spatial.learn(3.0 * human * complex_noise(rng, STFT.bins), ones, 0.9, True, True)
+            spatial.learn(3.0 * human * complex_noise(rng, STFT.bins), ones, SPEECH, True, True)
         assert np.abs(20 * np.log10(np.abs(spatial.step(human[None])[0][8:]))).mean() < 1.0
 
 
@@ -161,7 +164,7 @@ def test_a_microphone_that_is_left_out_is_not_heard() -> None:
     spatial = SpatialFilter(STFT, 3, fan_below())
     spatial.use(np.array([False, True, True]))
     for _ in range(10):
-        spatial.learn(complex_noise(rng, 3, STFT.bins), np.ones(STFT.bins, np.float32), 0.9, True, True)
+        spatial.learn(complex_noise(rng, 3, STFT.bins), np.ones(STFT.bins, np.float32), SPEECH, True, True)
     assert np.abs(spatial.weights[0]).max() < 1e-2 * np.abs(spatial.weights[1:]).max()
 
 
@@ -170,7 +173,7 @@ def test_a_turn_as_a_whole_weighs_all_of_it_the_same() -> None:
     spatial = SpatialFilter(STFT, 3, fan_below())
     human, ones = plane_wave(np.array([0.0, 0.8, 0.6])), np.ones(STFT.bins, np.float32)
     for _ in range(60):
-        spatial.learn(3.0 * human * complex_noise(rng, STFT.bins), ones, 0.9, True, True)
+        spatial.learn(3.0 * human * complex_noise(rng, STFT.bins), ones, SPEECH, True, True)
     found = spatial.finished()
     heard = np.einsum("cf,cf->f", found.conj(), human)[8:]
     assert np.abs(20 * np.log10(np.abs(heard))).max() < 0.5
@@ -195,7 +198,7 @@ def test_a_human_in_a_room_is_changed_less_than_the_fan_is_lowered() -> None:
             changed += np.sum(np.abs(spatial.step(human[None])[0] - human[0]) ** 2)
             left += np.sum(np.abs(spatial.step(fan[None])[0]) ** 2)
             before += np.sum(np.abs(fan[0]) ** 2)
-            spatial.learn((human + fan).astype(np.complex64), mask, 0.9, True, True)
+            spatial.learn((human + fan).astype(np.complex64), mask, SPEECH, True, True)
         assert changed + NOISE_WEIGHT * left < NOISE_WEIGHT * before
         assert left < 0.5 * before
 
@@ -213,7 +216,7 @@ def test_a_human_who_is_suddenly_elsewhere_loses_little_and_is_found_within_half
                 level = 2.0 * rng.gamma(0.5, 1.0, STFT.bins)
                 fan = 0.7 * np.einsum("ijf,jf->if", root, complex_noise(rng, 3, STFT.bins))
                 error = (human * level * complex_noise(rng, STFT.bins) + fan).astype(np.complex64)
-                spatial.learn(error, (level / (level + 1.0)).astype(np.float32), 0.9, True, True)
+                spatial.learn(error, (level / (level + 1.0)).astype(np.float32), SPEECH, True, True)
                 if hops == 31 and hop in (0, 30):
                     lost.append(-10 * np.log10(np.mean(np.abs(spatial.step(human[None])[0][6:250]) ** 2)))
     at_once, later = np.mean(np.reshape(lost, (4, 2)), axis=0)
@@ -230,7 +233,7 @@ def test_the_level_of_an_array_that_is_not_calibrated_means_nothing(scale: float
         for hop in range(60):
             speaks = (hop < 30) == human_first
             error = 0.05 * complex_noise(rng, 3, STFT.bins) + speaks * human * complex_noise(rng, STFT.bins)
-            spatial.learn(np.complex64(scale) * error, gain, 0.9 if speaks else 0.1, speaks, True)
+            spatial.learn(np.complex64(scale) * error, gain, SPEECH if speaks else NOISE, speaks, True)
         return spatial.weights
 
     usual = learned(1.0)
@@ -244,7 +247,7 @@ def test_a_human_without_any_noise_beside_them_stays(microphones: int) -> None:
     rng, spatial = np.random.default_rng(10), SpatialFilter(STFT, microphones)
     human, gain = complex_noise(rng, microphones, STFT.bins), np.ones(STFT.bins, np.float32)
     for _ in range(400):
-        spatial.learn(human, gain, 0.9, True, True)
+        spatial.learn(human, gain, SPEECH, True, True)
     np.testing.assert_allclose(spatial.step(human[None])[0], human[0], atol=0.05)
 
 
@@ -256,15 +259,17 @@ def test_the_weights_of_a_finished_turn_know_nothing_of_the_turn_before() -> Non
         rng, spatial = np.random.default_rng(9), SpatialFilter(STFT, 3, noise)
         for talker in turns:
             for _ in range(60):
-                spatial.learn((talker * rng.standard_normal(STFT.bins)).astype(np.complex64), gain, 0.9, True, True)
-            spatial.learn(np.zeros((3, STFT.bins), np.complex64), gain, 0.4, False, True)
+                spatial.learn((talker * rng.standard_normal(STFT.bins)).astype(np.complex64), gain, SPEECH, True, True)
+            spatial.learn(np.zeros((3, STFT.bins), np.complex64), gain, UNSURE, False, True)
         return spatial.finished()
 
     alone, after = finished(talkers[1:]), finished(talkers)
     assert np.abs(after - alone).max() < 0.15 * np.abs(alone).max()
 
 
-@pytest.mark.parametrize(("probability", "changed"), [(0.29, True), (0.31, False), (0.49, False), (0.51, True)])
+@pytest.mark.parametrize(
+    ("probability", "changed"), [(UNLIKELY - 0.01, True), (UNLIKELY, False), (LIKELY, False), (LIKELY + 0.01, True)]
+)
 def test_a_hop_tells_of_the_noise_or_of_the_human_where_it_is_likely_and_of_neither_between(probability, changed):
     rng = np.random.default_rng(0)
     spatial, ones = SpatialFilter(STFT, 3, fan_below()), np.ones(STFT.bins, np.float32)
