@@ -190,6 +190,8 @@ def _diagnose(commands: argparse._SubParsersAction) -> None:
     option = commands.add_parser("diagnose", help=told).add_argument
     told = "write a profile with all that was found; without --profile, one made from the recording"
     option("--apply", metavar="P2.npz", help=told)
+    told = "print every figure, and what else was tried, in place of ten lines"
+    option("--verbose", action="store_true", help=told)
     told = "where no effect explains the recording: write the curve, gain, filter or lag that does as an effect of your own"
     option("--write-effect", type=effect_file, metavar="MINE.py", help=told)
     option("--mic-channels", **MIC_CHANNELS)

@@ -82,8 +82,8 @@ class Fitted:
             facts.append(("Running filter", erle, what))
         return facts
 
-    def lines(self) -> list[str]:
-        """For the terminal: the excess before and after, the values, the proof, what to beware of."""
+    def lines(self, verbose: bool = True) -> list[str]:
+        """For the terminal: the excess before and after, the proof, what to beware of; verbose: the values, and how they came about."""
         values = dict(self.profile.echo.effects)
         added = joined(self.names) or "nothing"
         before_db, after_db = self.before.excess_db, self.after.excess_db
@@ -91,12 +91,13 @@ class Fitted:
             f"{added} added: {decibels(before_db)} dB over the noise floor before, {decibels(after_db)} dB after,"
             " fitted to all of the recording"
         ]
-        if self.promised_db is not None:
-            left = decibels(self.promised_db)
-            lines.append(f"promised    fitted to half of it they left {left} dB of the other half")
-        for name in self.names:
-            lines += _values(name, values[name], len(self.names) > 1)
-        lines += [f"{'recording':<12}{text}" for text in self.before.warnings]
+        if verbose:
+            if self.promised_db is not None:
+                left = decibels(self.promised_db)
+                lines.append(f"promised    fitted to half of it they left {left} dB of the other half")
+            for name in self.names:
+                lines += _values(name, values[name], len(self.names) > 1)
+            lines += [f"{'recording':<12}{text}" for text in self.before.warnings]
         lines.append(proof_line(self.proof, self.unproven))
         lines += [f"{'dropped':<12}{name}: with it the running filter would be worse" for name in self.dropped]
         kept = "happened in this recording and is kept with it: of others the profile predicts what it did before"

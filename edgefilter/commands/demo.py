@@ -180,7 +180,7 @@ def _draw_mended(folder: Path, case: Case, applied: Fitted, filtered: dict[str, 
     html, plots = _drawer("html"), _drawer("plots")
     if not html or not plots:
         return []
-    names = {"profile": "robot.npz", "recording": "mic.wav", "reference": "tts.wav", "effects": []}
+    names = {"profile": "robot.npz", "recording": "mic.wav", "reference": "tts.wav", "apply": "better.npz"}
     page = html.diagnosis_page(case.profile, applied.found, case.mic, case.reference, names, applied.facts())
     html.write_page(folder / "report.html", page)
     sounds = {

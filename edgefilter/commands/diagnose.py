@@ -20,7 +20,7 @@ from edgefilter.echo.effects.catalogue import names as known_effects
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
 from edgefilter.profile.array import ArrayCalibration
 from edgefilter.profile.data import Profile
-from edgefilter.report.text import add_command, diagnosis_lines
+from edgefilter.report.text import LINES, MORE, add_command, diagnosis_lines, next_command, summary_lines
 from edgefilter.types import Samples
 
 
@@ -55,18 +55,21 @@ def main(args: argparse.Namespace) -> None:
     if applied:
         more["applied"] = {**applied.to_dict(), "output": args.apply}
     told: list[str] = []
-    following: list[str] = []
-    if found.ranking and not args.apply:
-        following = [f"next        {add_command([one.effect for one in in_order(found.ranking)], vars(args))}"]
     if applied:
         found = applied.found or found
-        told = [*applied.lines(), f"written to {args.apply}"]
+        told = [*applied.lines(args.verbose), f"written to {args.apply}"]
     elif args.apply and not refused:
         told = [f"nothing was found to add: {args.apply} is not written"]
+    following = next_command(found, vars(args), args.apply if applied else None)
     if args.write_effect:
-        told += _written(args, found)
-    verdict, *rest = diagnosis_lines(found, args.profile is not None)
-    print_result(args, [verdict, *following, *rest, *told], {**found.to_dict(), **more})
+        own, following = _written(args, found, following)
+        told.append(own)
+    calibrated = args.profile is not None
+    if args.verbose:
+        lines = [*diagnosis_lines(found, calibrated), *told]
+    else:
+        lines = [*summary_lines(found, calibrated, LINES - 2 - len(told)), *told, MORE]
+    print_result(args, lines, {**found.to_dict(), **more})
     if html:
         with progress("page of the diagnosis"):
             outcome = applied.facts() if applied else ()
@@ -74,6 +77,7 @@ def main(args: argparse.Namespace) -> None:
         print_result(args, [f"report      {args.report}"])
     if refused:
         raise refused
+    print_result(args, [f"next        {following}"])
 
 
 def _apply(
@@ -106,10 +110,10 @@ def _apply(
     return applied, None
 
 
-def _written(args: argparse.Namespace, found: Diagnosis) -> list[str]:
-    """The free law of the diagnosis as an effect of the user's own; what to say of it."""
+def _written(args: argparse.Namespace, found: Diagnosis, following: str) -> tuple[str, str]:
+    """The free law of the diagnosis as an effect of the user's own; what to say of it, and the command that follows then."""
     if found.law is None:
-        return [f"no law explains much more than what is named: {args.write_effect} is not written"]
+        return f"no law explains much more than what is named: {args.write_effect} is not written", following
     path = Path(args.write_effect)
     try:
         with whole(path) as file:
@@ -119,4 +123,4 @@ def _written(args: argparse.Namespace, found: Diagnosis) -> list[str]:
             f"{path} cannot be written ({error.strerror}); name a file in a folder that exists"
         ) from None
     own = {**vars(args), "effects": [*(args.effects or ()), args.write_effect]}
-    return [f"own effect  {path}", f"next        {add_command([*found.law.beside, path.stem], own)}"]
+    return f"own effect  {path}", add_command([*found.law.beside, path.stem], own)

@@ -69,7 +69,7 @@ def diagnosis_page(
         "kind": "diagnosis",
         "headline": text.headline(found.verdict, [finding.effect for finding in found.ranking], bool(names["profile"])),
         "findings": [_finding(finding) for finding in found.ranking],
-        "command": text.add_command([one.effect for one in steps], names).split(" ") if steps and not outcome else [],
+        "command": text.next_command(found, names, names.get("apply") if outcome else None).split(" "),
         "left": text.sentence(found.evidence) if found.evidence else "",
         "look": _look(found.closer_look, found.law),
         **_statistics(found),
@@ -238,7 +238,7 @@ def _facts(before: Comparison, after: Comparison | None, irreducible_db: float |
     if after is not None:
         facts.append(("With what was found", f"{text.decibels(after.excess_db)} dB", "over the noise floor"))
     facts.append(("Noise floor", f"{before.noise_floor_db:.1f} dBFS", "the fan, from the calibration"))
-    if irreducible_db is not None:
+    if irreducible_db:
         facts.append(("Irreducible", f"{text.decibels(irreducible_db)} dB", "that no model can predict"))
     return facts
 
@@ -276,8 +276,8 @@ def _finding(finding: Finding) -> dict[str, object]:
         "after": text.decibels(finding.excess_after_db),
         "share": f"{100 * finding.share:.0f}",
         "evidence": text.sentence(finding.evidence),
-        "family": text.sentence(text.family_line(finding)),
-        "parameters": [(name, text.interval_text(interval)) for name, interval in finding.parameters.items()],
+        "family": text.sentence(f"{finding.family}; {text.chance(finding)}"),
+        "parameters": list(text.known_parameters(finding).items()),
     }
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,10 @@ UNITS = {"1": "", "1e-6": "ppm"}
 WEIGHT = 0.01
 """Least share of the residual's power for which the text names the cause of a dependence. Half a minute of sound also shows
 smaller dependences, which nobody would correct."""
+LINES = 10
+"""Of a diagnosis as `edgefilter diagnose` prints it without --verbose: with the command typed before it half of a terminal."""
+MORE = "more        --verbose: all figures and what else was tried; --report PAGE.html: pictures and sound"
+CALIBRATE = "edgefilter calibrate --live --output robot.npz"
 HEADS = ("rank", "effect", "alone, dB", "added, dB", "numbers", "Delta BIC", "verdict")
 
 
@@ -116,44 +121,89 @@ def comparison_lines(found: Comparison) -> list[str]:
     return lines + independence_lines(found.independence)
 
 
+def summary_lines(found: Diagnosis, calibrated: bool = True, most: int = LINES - 2) -> list[str]:
+    """Format what a person needs to go on: what is wrong, how sure that is, what is left, and as many warnings and hints as fit.
+
+    most: lines; more where the findings alone need more. calibrated: as of diagnosis_lines().
+    """
+    lines = [_verdict(found, calibrated)]
+    for rank, finding in enumerate(found.ranking, start=1):
+        lines += _finding(rank, finding)[:2]
+    lines += [_left(found), *_proof(found)]
+    hints = [f"WARNING     {text}" for text in found.comparison.warnings] + _hints(found)
+    hints += [f"advice      {line}" for line in found.advice]
+    return [*lines, *hints[: max(most - len(lines), 0)]]
+
+
 def diagnosis_lines(found: Diagnosis, calibrated: bool = True) -> list[str]:
-    """Format a diagnosis: the verdict, the error budget, each finding with its evidence, the statistics, and the comparison.
+    """Format all of a diagnosis: the verdict, the error budget, each finding with its evidence, the statistics, and the comparison.
 
     calibrated: False where the recording itself made the profile.
     """
-    names = [finding.effect for finding in found.ranking]
     added = in_order(found.ranking)
     profile = "the profile as it is" if calibrated else "a stationary linear path"
     steps = [(profile, added[0].excess_before_db if added else found.comparison.excess_db)]
     steps += [(f"with {finding.effect}", finding.excess_after_db) for finding in added]
+    if found.irreducible_db:
+        steps.append(("irreducible part", found.irreducible_db))
     top = max(1.0, *(db for _, db in steps))
-    steps.append(("irreducible part", found.irreducible_db))
-    lines = [
-        f"verdict     {found.verdict}: {headline(found.verdict, names, calibrated)}",
-        "budget      dB over the noise floor",
-    ]
+    lines = [_verdict(found, calibrated), "budget      dB over the noise floor"]
     lines += [f"  {name:<27} {decibels(db):>6}  {_bar(db / top)}".rstrip() for name, db in steps]
     for rank, finding in enumerate(found.ranking, start=1):
         lines += _finding(rank, finding)
     if found.evidence:
         lines.append(f"left        {sentence(found.evidence)}")
-    if found.closer_look:
-        lines.append(f"closer      {sentence(found.closer_look.sentence)}")
-    if law := found.law:
-        lines.append(f"law         {law.family}: {law.words}; --write-effect MINE.py writes it as your own effect")
-    if found.proof or found.unproven:
-        lines.append(proof_line(found.proof, found.unproven))
-    lines += precision_lines(found.precision)
+    lines += [*_hints(found), *_proof(found), *precision_lines(found.precision)]
     if found.ranking:
         lines += independence_lines(found.independence, "with all findings")
     lines += [*candidate_lines(found.tried), *(f"advice      {line}" for line in found.advice)]
     return [*lines, f"where       the excess lies with {profile}:", *comparison_lines(found.comparison)]
 
 
+def _verdict(found: Diagnosis, calibrated: bool) -> str:
+    said = headline(found.verdict, [finding.effect for finding in found.ranking], calibrated)
+    return f"verdict     {found.verdict}: {said}"
+
+
+def _left(found: Diagnosis) -> str:
+    """Say what is left; where it is noise of the robot's own that no waveform predicts, that and no other figure."""
+    whole = f" of {decibels(found.comparison.excess_db)}" if found.ranking else ""
+    if found.irreducible_db:
+        told = f"{decibels(found.irreducible_db)}{whole} dB over the fan: noise, of which no waveform can be predicted."
+    else:
+        told = f"{decibels(found.remaining_db)}{whole} dB over the noise floor."
+    return f"left        {told} {sentence(found.evidence)}".rstrip()
+
+
+def _hints(found: Diagnosis) -> list[str]:
+    """Say where to look closer, and which law was found."""
+    look = [f"closer      {sentence(found.closer_look.sentence)}"] if found.closer_look else []
+    own = "--write-effect MINE.py writes it as your own effect"
+    return look + ([f"law         {found.law.family}: {found.law.words}; {own}"] if found.law else [])
+
+
+def _proof(found: Diagnosis) -> list[str]:
+    return [proof_line(found.proof, found.unproven)] if found.proof or found.unproven else []
+
+
+def next_command(found: Diagnosis, names: Mapping[str, Any], written: str | None = None) -> str:
+    """Give the one command that follows a diagnosis; written: the profile that it wrote, if any."""
+    if found.ranking and written is None:
+        return add_command([finding.effect for finding in in_order(found.ranking)], names)
+    channels = f" --mic-channels {','.join(map(str, names['mic_channels']))}" if names.get("mic_channels") else ""
+    if found.verdict == "unexplained" and not names.get("report"):
+        return f"edgefilter diagnose {files_given(names)}{channels} --report page.html"
+    profile = written or names["profile"]
+    if profile is None or found.verdict == "unexplained":
+        return CALIBRATE
+    files = files_given({**names, "profile": profile}).replace("--recording ", "--input ", 1)
+    return f"edgefilter run {files}{channels} --output filtered.wav"
+
+
 def add_command(effects: Sequence[str], names: Mapping[str, Any]) -> str:
     """Give the command that writes a profile with these effects, of all microphones; without a profile, the one that calibrates."""
     if names["profile"] is None:
-        return "edgefilter calibrate --live --output robot.npz"
+        return CALIBRATE
     files = files_given(names)
     output = shlex.quote(str(Path(str(names["profile"])).with_suffix(f".{'.'.join(effects)}.npz")))
     if channels := names.get("mic_channels"):
@@ -163,7 +213,7 @@ def add_command(effects: Sequence[str], names: Mapping[str, Any]) -> str:
 
 def files_given(names: Mapping[str, Any]) -> str:
     """The options that name profile, recording, reference and own effects, as words of a command."""
-    files = [(role, names[role]) for role in ("profile", "recording", "reference")]
+    files = [(role, names[role]) for role in ("profile", "recording", "reference") if names[role]]
     files += [("effects", file) for file in names.get("effects") or ()]
     return " ".join(f"--{role} {shlex.quote(str(file))}" for role, file in files)
 
@@ -181,10 +231,11 @@ def coarser(times: Sequence[tuple[float, float, float]], rows: int) -> list[tupl
 def _finding(rank: int, finding: Finding) -> list[str]:
     fall = f"{decibels(finding.excess_before_db)} to {decibels(finding.excess_after_db)} dB"
     return [
-        f"{rank:>2}. {heading(finding)} ({finding.effect}): {fall}, {100 * finding.share:.0f} % of the excess",
+        f"{rank:>2}. {heading(finding)} ({finding.effect}): {fall}, {100 * finding.share:.0f} % of the excess;"
+        f" {chance(finding)}",
         f"      {sentence(finding.evidence)}",
-        f"      {family_line(finding)}",
-        *(f"      {name} = {interval_text(interval)}" for name, interval in finding.parameters.items()),
+        f"      {finding.family}",
+        *(f"      {name} = {told}" for name, told in known_parameters(finding).items()),
     ]
 
 
@@ -193,9 +244,21 @@ def heading(finding: Finding) -> str:
     return title(finding.effect) + (f", most like {spoken(finding.like)}" if finding.like else "")
 
 
-def family_line(finding: Finding) -> str:
-    """Name the family of a finding, and say how often a recording in which nothing is missing shows as much."""
-    return f"{finding.family}; {percent(finding.p_value)} of ordinary recordings show as much by chance"
+def chance(finding: Finding) -> str:
+    """Say how often a recording in which nothing is missing shows as much of a finding."""
+    return f"{percent(finding.p_value)} of ordinary recordings show as much by chance"
+
+
+def known_parameters(finding: Finding) -> dict[str, str]:
+    """Format each parameter of a finding with its range; without one where that is as wide as what the parameter may be at all."""
+    effect = find(finding.effect) if finding.effect in names() else None
+    bounds = {p.name: (p.low, p.high) for p in effect.parameters} if effect else {}
+    return {
+        name: f"{interval_text(replace(one, low=one.value, high=one.value))}, which this recording hardly tells"
+        if (one.low, one.high) == bounds.get(name)
+        else interval_text(one)
+        for name, one in finding.parameters.items()
+    }
 
 
 def _table(heading: str, unit: str, rows: Sequence[tuple[float, float, float]]) -> list[str]:

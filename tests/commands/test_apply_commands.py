@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -85,7 +86,7 @@ def test_of_two_the_one_that_hurts_is_named(scene: Path, tmp_path: Path, capsys)
 def test_all_that_is_found_is_applied_in_one_step(scene: Path, tmp_path: Path, capsys) -> None:
     """What is left is one figure in console, JSON and page, and `compare` has it of the profile that was written."""
     better, page, figures = tmp_path / "better.npz", tmp_path / "r.html", tmp_path / "d.json"
-    assert main(arguments(scene, "diagnose", "--apply", better, "--report", page, "--json", figures)) == 0
+    assert main(arguments(scene, "diagnose", "--apply", better, "--report", page, "--json", figures, "--verbose")) == 0
     out, told = capsys.readouterr().out, json.loads(figures.read_text())
     left_db, last = told["applied"]["excess_after_db"], min(told["ranking"], key=lambda one: one["excess_before_db"])
     assert told["remaining_db"] == last["excess_after_db"] == pytest.approx(left_db, abs=1e-3)
@@ -121,13 +122,13 @@ def test_without_a_profile_one_is_made_and_proven_against_none(scene: Path, tmp_
     files = ["--recording", str(scene / "mic.wav"), "--reference", str(scene / "ref.wav")]
     assert main(["diagnose", *files, "--apply", str(made), "--json", str(tmp_path / "a.json")]) == 0
     out = capsys.readouterr().out
-    assert f"written to {made}" in out and "next " not in out
+    *_, written, following = out.splitlines()
+    assert written == f"written to {made}" and following.startswith("next        edgefilter run ")
     proof = json.loads((tmp_path / "a.json").read_text())["applied"]["proof"]
     assert proof["erle_after_db"] > proof["erle_before_db"] + 3.0
     assert Profile.load(made).source == PROVISIONAL
     human = tmp_path / "human.wav"
-    run = ["run", "--input", files[1], "--reference", files[3], "--profile", str(made), "--output", str(human)]
-    assert main([*run, "--engine", "linear", "--quiet"]) == 0
+    assert main([*shlex.split(following)[2:-1], str(human), "--engine", "linear", "--quiet"]) == 0
     before, after = (np.mean(soundfile.read(path)[0] ** 2) for path in (scene / "mic.wav", human))
     assert after < 0.02 * before
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import base64
 import io
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,11 +15,11 @@ from PIL import Image
 from edgefilter.diagnosis.closer_look import CloserLook, Curve
 from edgefilter.diagnosis.compare import compare
 from edgefilter.diagnosis.diagnose import Diagnosis, Finding, Interval
-from edgefilter.echo.effects.catalogue import EFFECTS
+from edgefilter.echo.effects.catalogue import EFFECTS, find
 from edgefilter.report import text
 from edgefilter.report.html import choices, compare_variants, diagnosis_page
 from edgefilter.report.media import LEVELS, MAX_COLUMNS, colour_scale, colours, sound, spectrogram_db, spectrogram_png
-from edgefilter.report.text import add_command, coarser, diagnosis_lines
+from edgefilter.report.text import LINES, add_command, coarser, diagnosis_lines, summary_lines
 from tests.diagnosis.robot_scene import profile, record, voice
 
 RATE = 16000
@@ -80,6 +82,43 @@ def test_the_terminal_says_verdict_budget_parameters_and_what_is_left():
         assert part in told, part
     bars = [len(line) - len(line.rstrip("#")) for line in lines if line.startswith("  with ")]
     assert bars[0] > bars[1] > 0
+
+
+def test_few_lines_say_what_is_wrong_how_sure_that_is_and_what_is_left():
+    x = voice(4.0)
+    found = replace(compare(profile(), record(x), x), warnings=tuple(f"warning {i}" for i in range(9)))
+    two = (finding("late_reverb", {"rt60_s": 0.61}), finding("my_own", {"depth": 2.0}, 1.0, 0.3))
+    diagnosis = Diagnosis("missing", found, two, "", 0.3, 0.0, profile().echo)
+    lines = summary_lines(diagnosis)
+    assert len(lines) == LINES - 2 and lines[0] == diagnosis_lines(diagnosis)[0]
+    assert "9.0 to 1.0 dB, 90 % of the excess; " in lines[1] and "by chance" in lines[1]
+    assert [line[:11].strip() for line in lines[5:]] == ["left", "WARNING", "WARNING"]
+    assert lines[5].startswith("left        0.3 of ") and "noise floor" in lines[5]
+    (left,) = (one for one in summary_lines(replace(diagnosis, irreducible_db=8.0)) if one.startswith("left"))
+    assert left.startswith("left        8.0 of ") and "0.3" not in left
+
+
+def test_a_range_that_says_nothing_is_not_told():
+    low, high = next((p.low, p.high) for p in find("rattle").parameters if p.name == "threshold")
+    one = replace(finding("rattle", {}), parameters={"threshold": Interval(0.1, low, high, "full scale")})
+    assert text.known_parameters(one) == {"threshold": "0.100 full scale, which this recording hardly tells"}
+
+
+@pytest.mark.parametrize(
+    ("verdict", "effects", "names", "written", "said"),
+    [
+        ("missing", ["tilt"], {}, None, "add tilt --profile p.npz --recording m.wav --reference r.wav --output"),
+        ("missing", ["tilt"], {}, "new.npz", "run --profile new.npz --input m.wav --reference r.wav --output"),
+        ("explained", [], {"mic_channels": (0, 2)}, None, "run --profile p.npz --input m.wav --reference r.wav --mic-"),
+        ("unexplained", [], {}, None, "diagnose --profile p.npz --recording m.wav --reference r.wav --report"),
+        ("unexplained", [], {"report": "r.html"}, None, "calibrate --live"),
+        ("explained", [], {"profile": None}, None, "calibrate --live"),
+    ],
+)
+def test_one_command_follows(verdict, effects, names, written, said):
+    known = {"profile": "p.npz", "recording": "m.wav", "reference": "r.wav", **names}
+    found = SimpleNamespace(verdict=verdict, ranking=[finding(name, {}) for name in effects])
+    assert text.next_command(found, known, written).startswith(f"edgefilter {said}")
 
 
 def test_long_recordings_are_summed_up_by_power():
