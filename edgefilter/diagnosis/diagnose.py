@@ -22,7 +22,7 @@ from edgefilter.diagnosis.proof import listed, with_fitted
 from edgefilter.diagnosis.result import Diagnosis, Finding, Interval, Verdict, in_order
 from edgefilter.diagnosis.score import Scorer, share_of
 from edgefilter.diagnosis.select import search
-from edgefilter.diagnosis.trials import Found, Trial
+from edgefilter.diagnosis.trials import Found
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.measurement import Values
 from edgefilter.profile.data import Profile
@@ -302,13 +302,8 @@ def _much_left(found: Found, criteria: Criteria) -> bool:
 
 def _without_doubtful(found: Found) -> Found:
     """The outcome of a search that explains too little, with nothing but what silences and voice both show."""
-    scorer, model, score, kept = Scorer(found.prepared), found.start, found.base, []
-    for step in found.steps:
-        if find(step.name).shows_in_silence:
-            model, before = model.with_effect(step.name, step.values), score
-            score = scorer.of(model)
-            kept.append(Trial.of(step.name, model, before, score))
-    return replace(found, model=model, final=score, steps=tuple(kept))
+    kept = {step.name: step.values for step in found.steps if find(step.name).shows_in_silence}
+    return found.with_only(Scorer(found.prepared), kept)
 
 
 def explained_level(found: Found) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -11,13 +11,11 @@ from edgefilter.diagnosis.closer_look import Curve
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.ordinary import p_value
 from edgefilter.diagnosis.score import Scorer
-from edgefilter.diagnosis.trials import Found, Trial
+from edgefilter.diagnosis.trials import Found, Trial, added
 from edgefilter.echo.effect import vanishes
 from edgefilter.echo.effects.catalogue import EFFECTS, find
 from edgefilter.echo.effects.free_laws import FreeLaw
-from edgefilter.echo.evidence import Score
 from edgefilter.echo.measurement import Values
-from edgefilter.echo.model import EchoModel
 from edgefilter.errors import UsageError
 
 MOST = 2
@@ -115,33 +113,23 @@ def with_laws(
         left = max(found.final.over_db - found.final.floor_db, 0.0)
         if found.final.excess_db <= (criteria.little_db if found.steps else criteria.explained_db):
             break
-        names = tuple(step.name for step in found.steps)
+        names = {step.name for step in found.steps}
         tried = [law for law in _trials(scorer, found, progress, without) if law.gain_db >= criteria.part * left]
-        shown = [law for law in tried if law.kept != names or p_value(law.name, law.gain_db) <= criteria.false_rate]
-        most = max((law.gain_db for law in shown), default=0.0)
-        beside = [law for law in shown if law.kept == names and law.gain_db >= criteria.nearly * most]
-        best = max(beside or shown, key=lambda law: law.gain_db, default=None)
-        if best is None:
+        instead = [law for law in tried if not names <= dict(law.model.effects).keys()]
+        beside = [law for law in tried if law not in instead and law.p_value <= criteria.false_rate]
+        most = criteria.nearly * max((law.gain_db for law in (*instead, *beside)), default=0.0)
+        choices = [law for law in beside if law.gain_db >= most] or [*instead, *beside]
+        if not choices:
             break
-        found = _rebuilt(scorer, found, _without_superfluous(scorer, found, best, criteria))
+        best = max(choices, key=lambda law: law.gain_db)
+        found = _with(scorer, found, _without_superfluous(scorer, found, best, criteria))
     return found
-
-
-@dataclass(frozen=True, eq=False)
-class _Tried:
-    """A law beside the names that are kept: the model, its score, and by how many dB the level is lower than by all names."""
-
-    name: str
-    kept: tuple[str, ...]
-    model: EchoModel
-    score: Score
-    gain_db: float
 
 
 def _trials(
     scorer: Scorer, found: Found, progress: Callable[[str], None] | None, without: Collection[str]
-) -> Iterator[_Tried]:
-    """Each law beside all names, and in place of those of its family."""
+) -> Iterator[Trial]:
+    """Each law beside all names, and in place of those of its family; how much more it explains than all names."""
     names = tuple(step.name for step in found.steps)
     for effect in EFFECTS:
         if not effect.free or effect.name in {*without, *dict(found.model.effects)}:
@@ -154,7 +142,7 @@ def _trials(
                 yield tried
 
 
-def _tried(scorer: Scorer, found: Found, name: str, kept: tuple[str, ...]) -> _Tried | None:
+def _tried(scorer: Scorer, found: Found, name: str, kept: Iterable[str]) -> Trial | None:
     """A law fitted beside some of the names; None where its fit finds nothing."""
     others, known = found.start, dict(found.model.effects)
     for other in kept:
@@ -166,31 +154,26 @@ def _tried(scorer: Scorer, found: Found, name: str, kept: tuple[str, ...]) -> _T
     if vanishes(find(name), values):
         return None
     model = others.with_effect(name, values)
-    score = scorer.of(model)
-    return _Tried(name, kept, model, score, found.final.level_db - score.level_db)
+    return Trial.of(name, model, found.final, scorer.of(model))
 
 
-def _without_superfluous(scorer: Scorer, found: Found, law: _Tried, criteria: Criteria) -> _Tried:
+def _without_superfluous(scorer: Scorer, found: Found, law: Trial, criteria: Criteria) -> Trial:
     """The law without the names beside which it explains no more than by chance."""
-    for name in law.kept:
-        alone = _tried(scorer, found, law.name, tuple(other for other in law.kept if other != name))
+    for name in added(found.start, law.model)[:-1]:
+        *kept, _ = added(found.start, law.model)
+        alone = _tried(scorer, found, law.name, [other for other in kept if other != name])
         if alone and p_value(name, law.gain_db - alone.gain_db) > criteria.false_rate:
             law = alone
     return law
 
 
-def _rebuilt(scorer: Scorer, found: Found, law: _Tried) -> Found:
-    """The outcome with a law, each effect with what it explains beside those before it; like: the strongest name that the law replaces."""
-    model, before, steps, known = found.start, found.base, [], dict(law.model.effects)
-    for name in (*law.kept, law.name):
-        model = model.with_effect(name, known[name])
-        score = law.score if name == law.name else scorer.of(model)
-        steps.append(Trial.of(name, model, before, score))
-        before = score
-    family = find(law.name).family
-    replaced = [step for step in found.steps if step.name not in law.kept and find(step.name).family == family]
+def _with(scorer: Scorer, found: Found, law: Trial) -> Found:
+    """The outcome with a law; like: the strongest name that the law replaces."""
+    family, values = find(law.name).family, dict(law.model.effects)
+    replaced = [step for step in found.steps if step.name not in values and find(step.name).family == family]
     like = {law.name: replaced[0].name} if replaced else {}
-    return replace(found, model=law.model, final=law.score, steps=tuple(steps), like={**found.like, **like})
+    outcome = found.with_only(scorer, {name: values[name] for name in added(found.start, law.model)})
+    return replace(outcome, like={**found.like, **like})
 
 
 def _drawn(effect: object, values: Values) -> tuple:

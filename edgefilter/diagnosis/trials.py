@@ -78,6 +78,15 @@ class Found:
     tried: tuple[Tried, ...] = ()
     like: Mapping[str, str] = field(default_factory=dict)
 
+    def with_only(self, scorer: Scorer, values: Mapping[str, Values]) -> Found:
+        """The outcome with nothing but these effects, each with what it explains beside those before it."""
+        model, score, steps = self.start, self.base, []
+        for name, of in values.items():
+            model, before = model.with_effect(name, of), score
+            score = scorer.of(model)
+            steps.append(Trial.of(name, model, before, score))
+        return replace(self, model=model, final=score, steps=tuple(steps))
+
     @cached_property
     def in_noise(self) -> Prepared:
         """The recording prepared with the fan that was found."""
