@@ -61,9 +61,14 @@ class Found:
         return self.heard > WINDOW + BETWEEN + MINIMUM
 
     @property
+    def prior(self) -> float:
+        """How likely such a lag is before anything is heard, over one that a robot usually has."""
+        return EARLY_ODDS if self.lag < -WAIT else 1.0
+
+    @property
     def odds(self) -> float:
         """That the robot arrives there, over that it does not, where it is as likely not to be heard at all."""
-        return (self.clearness / EVEN) ** STEEP * (EARLY_ODDS if self.lag < -WAIT else 1.0)
+        return (self.clearness / EVEN) ** STEEP * self.prior
 
 
 class LagSearch:
@@ -74,12 +79,15 @@ class LagSearch:
     that early reflections do not pull the peak, and the peaks of all microphones lie at one lag. Chance peaks grow with the
     root of the energy that a lag lets overlap, so the correlation is divided by that. `prepare`, `listen` and `find` are one
     search and cost one transform each, `listen` one a microphone, so that they can be spread over three hops; while the
-    reference to be looked at is short, so are the transforms. early: samples by which the reference may be late.
+    reference to be looked at is short, so are the transforms. early: samples by which the reference may be late. window: another
+    length than WINDOW; `before` takes none.
     """
 
-    def __init__(self, max_lag: int, responses: Sequence[Samples] | None = None, early: int = 0) -> None:
-        self._max_lag, self._early = max_lag, early
-        self.span = self._size = COARSE * fft.next_fast_len(-(-(max_lag + early + WINDOW) // COARSE), real=True)
+    def __init__(
+        self, max_lag: int, responses: Sequence[Samples] | None = None, early: int = 0, window: int = WINDOW
+    ) -> None:
+        self._max_lag, self._early, self._window = max_lag, early, window
+        self.span = self._size = COARSE * fft.next_fast_len(-(-(max_lag + early + window) // COARSE), real=True)
         self._signed = responses is not None
         self._short = COARSE * fft.next_fast_len(-(-self.span // (2 * COARSE)), real=True)
         sizes = (self.span, self._short, WINDOW + 2 * ASIDE)
@@ -87,8 +95,8 @@ class LagSearch:
 
     def prepare(self, ref: Tape | Playback, now: int, since: int) -> None:
         """Take the reference between the positions since and now."""
-        self._size = size = self._short if now - since <= self._short - self._early - WINDOW else self.span
-        self._lags = self._early + min(self._max_lag, size - self._early - WINDOW)
+        self._size = size = self._short if now - since <= self._short - self._early - self._window else self.span
+        self._lags = self._early + min(self._max_lag, size - self._early - self._window)
         first = max(since - (now - size), self._early)
         r = np.zeros(size, np.float32)
         r[first:] = ref.read(now - size + first, now)
@@ -101,16 +109,16 @@ class LagSearch:
         self._prepared, self._since = now, since
 
     def listen(self, mics: Mapping[int, Tape], now: int, since: int) -> None:
-        """Take the microphones up to now, but none of it before since; at most WINDOW samples after `prepare`.
+        """Take the microphones up to now, but none of it before since; at most a window after `prepare`.
 
         mics: by number, where the responses are known several; their evidence is summed.
         """
-        skipped = min(max(max(since, self._since) - (now - WINDOW), 0), WINDOW)
-        self._at, self._start = now, self._size - WINDOW + skipped
+        skipped = min(max(max(since, self._since) - (now - self._window), 0), self._window)
+        self._at, self._start = now, self._size - self._window + skipped
         self._crosses = []
-        for number, mic in mics.items() if skipped <= WINDOW - MINIMUM else ():
+        for number, mic in mics.items() if skipped <= self._window - MINIMUM else ():
             x = np.zeros(self._size, np.float32)
-            x[self._start :] = mic.read(now - WINDOW + skipped, now)
+            x[self._start :] = mic.read(now - self._window + skipped, now)
             _soften(x[self._start :])
             if x.any():
                 self._crosses.append(self._whitened(x, self._reference, number))

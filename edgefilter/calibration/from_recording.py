@@ -7,15 +7,16 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import binary_closing, uniform_filter1d
 
+from edgefilter.alignment.belief import find_lag
 from edgefilter.calibration.sweep import DRIFT_REACH
 from edgefilter.dsp.fractional_delay import delayed, interpolate
 from edgefilter.dsp.frames import SILENT, all_block_power, block_power, decibels, frames
-from edgefilter.dsp.lag import correlation_near, flat_cross, highest
+from edgefilter.dsp.lag import correlation_near, flat_cross
 from edgefilter.dsp.psd import ROUNDING_PSD, periodograms, third_octave_bands
 from edgefilter.echo.effects.catalogue import EFFECTS
 from edgefilter.echo.measurement import whiten
 from edgefilter.echo.model import EchoModel
-from edgefilter.echo.recording import BLOCK, MAX_OFFSET, fitted_blocks, paired
+from edgefilter.echo.recording import BLOCK, fitted_blocks, paired
 from edgefilter.echo.wiener import convolve_from, fit_filter
 from edgefilter.errors import SignalError
 from edgefilter.profile.approximation import CLEARLY_DB
@@ -23,9 +24,6 @@ from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, GRID_HZ, PROVIS
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 TAPS = 4096
-STANDS_OUT = 8.0
-"""Times the root mean square of all lags that the true one reaches; 4.5 measured where there is no robot, 10 to 87
-where there is."""
 OTHERS_DB = 6.0
 """How far above the robot something is that is not the robot's."""
 UPSAMPLED = 4
@@ -108,25 +106,6 @@ def self_calibrate(recording: Samples, reference: Samples) -> Profile:
         warnings=tuple(_warnings(seconds, others(target, predicted))),
         source=PROVISIONAL,
     )
-
-
-def find_lag(recording: Samples, reference: Samples) -> int:
-    """Samples by which recording (n,) lags behind reference (n,), by the phase transform (Knapp & Carter 1976).
-
-    Both spectra are flattened, so that a talker who is louder than the robot does not hide it. Raises SignalError where
-    no lag stands out: the highest of independent values at all lags is 4 to 5 times their root mean square.
-    """
-    n = fft.next_fast_len(2 * recording.size, real=True)
-    reach = min(int(MAX_OFFSET * SAMPLE_RATE), recording.size - 1)
-    lag, height = highest(np.abs(correlation_near(flat_cross(reference, recording, n), n, reach)))
-    if not height > STANDS_OUT:
-        level = decibels(np.mean(np.square(reference, dtype=np.float64)))
-        raise SignalError(
-            f"the recording does not contain the reference (of {level:.0f} dBFS) at any lag up to {MAX_OFFSET:g} s, so"
-            " there is no robot in it to learn from: give a recording in which the robot talks, or a calibration"
-            " (--profile)"
-        )
-    return lag
 
 
 def _drifting(x: Samples, ppm: float) -> Samples:

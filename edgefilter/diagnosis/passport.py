@@ -3,28 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
 from scipy import fft
 
+from edgefilter.alignment.belief import Belief, absent, believe
 from edgefilter.alignment.coarse_lag import CoarseLag
-from edgefilter.calibration.from_recording import STANDS_OUT, fan_in_silences, find_drift, find_lag, silences
+from edgefilter.calibration.from_recording import fan_in_silences, find_drift, silences
 from edgefilter.calibration.multisine import PERIOD
 from edgefilter.diagnosis.compare import rounded
 from edgefilter.diagnosis.prepare import FRAME, HOP, leads
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.fractional_delay import delayed, interpolate
 from edgefilter.dsp.frames import block_power, blocks, decibels, frames
-from edgefilter.dsp.lag import correlation_near, flat_cross, highest
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.dsp.psd import frequencies, hann, third_octave_bands, total_power
 from edgefilter.echo.recording import paired
 from edgefilter.errors import SignalError
 from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.types import SAMPLE_RATE, Array, Samples
+from edgefilter.types import SAMPLE_RATE, Samples
 
 ENGINES = ("linear", "ss", "crnn")
 """Those that follow any device without knowing it."""
@@ -34,8 +33,6 @@ SETTLED_S = 5.0
 """The filter has this long with the robot alone before it is measured, and before the human speaks."""
 PAUSE_S = 2.0
 """Between two turns of the human; a turn that is cut shorter by the recording's end does not count."""
-WINDOW_S, STRETCH = 2.0, 1024
-"""Windows in which the lag is looked for, that many samples around what the whole says."""
 LONG, LEAST_FRAMES = 4 * PERIOD, 4
 """Samples of the longer of two analysis frames: 2 s, which no room that people talk in outlasts. A recording holds at least
 LEAST_FRAMES frames of a length, or that length is not used."""
@@ -91,8 +88,8 @@ class Expected:
 class Passport:
     """All that one recording tells; levels in dB of full scale.
 
-    lag_ms, lag_spread_ms: median of the windows with a sharp arrival, and the span of their middle eight tenths; sharp:
-    the share of windows that have one; without any the lag is coarse, to a hop of 16 ms. drift_ppm: parts of a million by
+    lag_ms, lag_spread_ms: median of the seconds whose lag is certain, and the span of their middle eight tenths; sharp:
+    the share of such seconds; without any the lag is coarse, to a hop of 16 ms. drift_ppm: parts of a million by
     which the reference's clock is faster (the lag shrinks), None where no arrival is sharp. change_db: what is neither
     linear in the reference nor noise, against what is linear. pauses: whether the robot is silent for long enough to know
     the noise; if not, it is at most that of the quietest moments. gated, clipped: shares of time and of samples.
@@ -161,8 +158,8 @@ def measure(
     _check(mic, ref)
     known = _levels(mic, ref) | {"human_db": human_db}
     progress("lag and drift")
-    lag, lags = _lag(mic, ref)
-    near, ppm = delayed(ref, lag), None
+    lag, believed = _lag(mic, ref)
+    lags, near, ppm = believed.certain, delayed(ref, lag), None
     if lags.size:
         ppm, behind = find_drift(mic, near)
         near = delayed(ref, lag + behind)
@@ -186,9 +183,9 @@ def measure(
         **known,
         noise_db=float(decibels(total_power(fan))),
         pauses=pauses_s > 0.0,
-        lag_ms=(lag + (float(np.median(lags)) if lags.size else 0.0)) / SAMPLE_RATE * 1000,
+        lag_ms=lag / SAMPLE_RATE * 1000,
         lag_spread_ms=spread,
-        sharp=lags.size / int(mic.size / (WINDOW_S * SAMPLE_RATE)),
+        sharp=lags.size / max(believed.lags.size, 1),
         drift_ppm=ppm,
         removable_db=removable,
         over_noise_db=over_noise,
@@ -245,43 +242,23 @@ def _levels(mic: Samples, ref: Samples) -> dict[str, Any]:
     return told | {"gated": float(np.mean((shut < GATED) & (played > 0.0)))}
 
 
-def _lag(mic: Samples, ref: Samples) -> tuple[int, Array]:
-    """Samples: the lag of the sharpest arrival, and those of `_lags` from it; without one the coarse lag, and none.
+def _lag(mic: Samples, ref: Samples) -> tuple[int, Belief]:
+    """Lag in samples, of a path without a sharp arrival the coarse lag, and what is believed look by look.
 
-    The sharpest arrival of the whole is chance where no window has one near it: of 55 pairs of unrelated real recordings seven
-    have such an arrival, and none of their windows has; of 21 true pairs a third of the windows or more. Raises SignalError where the
-    reference is not found, or is later than the recording.
+    Raises SignalError where the reference is not found, or is later than the recording.
     """
-    lag: int | None = None
-    lags: Array = np.zeros(0)
-    with suppress(SignalError):
-        lag = find_lag(mic, ref)
-        lags = _lags(mic, delayed(ref, lag))
-    if not lags.size:
+    found = believe(mic, ref)
+    lag = found.lag
+    if lag is None:
         coarse = CoarseLag(HOP, 2 * SAMPLE_RATE)
         for part in zip(blocks(mic, HOP), blocks(ref, HOP)):
             coarse.step(*part)
         lag = coarse.find()
     if lag is None:
-        raise SignalError(
-            "the recording does not contain the reference at any lag: is it of another recording, or was the loudspeaker"
-            " muted? ('edgefilter doctor' finds wrong connections)"
-        )
+        raise absent(ref)
     if early := leads(lag):
         raise SignalError(early)
-    return lag, lags
-
-
-def _lags(mic: Samples, near: Samples) -> Array:
-    """Samples by which the microphone lags behind the aligned reference, in those windows whose arrival is sharp, (w,)."""
-    size, found = round(WINDOW_S * SAMPLE_RATE), []
-    for heard, played in zip(blocks(mic, size), blocks(near, size)):
-        if heard.any() and played.any():
-            cross = flat_cross(played, heard, 2 * size)
-            lag, height = highest(np.abs(correlation_near(cross, 2 * size, STRETCH)))
-            if height > STANDS_OUT:
-                found.append(lag)
-    return np.array(found, float)
+    return lag, found
 
 
 class _Spectra:

@@ -80,7 +80,7 @@ def rows(found: Passport) -> list[tuple[str, str, str]]:
         ("microphone", f"{found.mic_db:.0f} dBFS", f"peak {found.mic_peak_db:.0f} dBFS"),
         ("reference", f"{found.ref_db:.0f} dBFS", f"peak {found.ref_peak_db:.0f} dBFS"),
         ("noise", noise, "in the robot's pauses" if found.pauses else "at most: in the quietest moments"),
-        ("lag", f"{found.lag_ms:.0f} ms", f"{spread}; sharp in {100 * found.sharp:.0f} % of the windows"),
+        ("lag", f"{found.lag_ms:.0f} ms", f"{spread}; sharp in {100 * found.sharp:.0f} % of the seconds"),
         ("drift", drift, "positive: the lag shrinks"),
         ("linear", f"{found.removable_db:.1f} dB", "what a fixed linear filter can take off, by coherence"),
         ("over noise", f"{found.over_noise_db:.1f} dB", "microphone over its noise"),

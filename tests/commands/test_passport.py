@@ -125,7 +125,8 @@ def test_a_lag_that_jumps_is_told_with_how_far(clean):
     said, heard = clean
     middle, moved = said.size // 2, 240
     found = measure(np.concatenate((heard[:middle], heard[middle - moved : -moved])), said, said[:RATE], engines=[])
-    assert found.lag_spread_ms == pytest.approx(1000 * moved / RATE, abs=0.3) and found.sharp == 1.0
+    assert found.lag_spread_ms == pytest.approx(1000 * moved / RATE, abs=0.3)
+    assert found.sharp == 11 / 12  # behind the jump the robot is silent for a second, whose lag nobody knows
 
 
 @pytest.mark.slow

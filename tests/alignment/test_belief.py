@@ -1,0 +1,69 @@
+"""The lag of a whole recording: what is found, how certainly, and that nothing is found where there is nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edgefilter.alignment.belief import believe, find_lag
+from edgefilter.dsp.fractional_delay import interpolate
+from edgefilter.errors import SignalError
+from tests.diagnosis.robot_scene import DELAY, record, voice
+
+RATE = 16000
+
+
+@pytest.fixture(scope="module")
+def said():
+    return voice(8.0)
+
+
+@pytest.fixture(scope="module")
+def heard(said):
+    return record(said)
+
+
+@pytest.mark.parametrize("lag", [-40_000, -3000, 0, 5000, 44_000])
+def test_any_lag_either_way_is_found_beside_a_talker_as_loud(said, heard, lag):
+    mixed = heard + voice(8.0, seed=5) * np.sqrt(np.mean(heard**2) / np.mean(voice(8.0, seed=5) ** 2))
+    shifted = np.roll(np.pad(mixed, (48_000, 48_000)), lag)
+    assert find_lag(shifted, np.pad(said, (48_000, 48_000))) == pytest.approx(DELAY + lag, abs=2)
+
+
+def test_swapped_files_are_found_at_the_lag_the_other_way_round(said, heard):
+    assert find_lag(said, heard) == pytest.approx(-DELAY, abs=2)
+
+
+def test_of_other_sounds_nothing_is_certain_and_it_is_said_which_error_is_likely(said):
+    for other in (voice(8.0, seed=9), 0.1 * np.random.default_rng(7).standard_normal(said.size).astype(np.float32)):
+        assert believe(other, said).certain.size == 0
+    with pytest.raises(SignalError, match=r"of another recording, or was the loudspeaker muted"):
+        find_lag(voice(8.0, seed=9), said)
+
+
+def test_each_second_has_the_lag_that_holds_there(said, heard):
+    middle, moved = said.size // 2, 900
+    found = believe(np.concatenate((heard[:middle], heard[middle - moved : -moved])), said)
+    assert found.lags == pytest.approx([DELAY] * 4 + [DELAY + moved] * 4, abs=2)
+    assert found.certain.size == 8
+
+
+def test_clocks_that_drift_move_the_lag(said):
+    slow = record(interpolate(said, np.arange(said.size) * (1 - 600e-6)))
+    lags = believe(slow, said).certain
+    middles = DELAY + 600e-6 * RATE * (np.arange(8) + 0.5)
+    assert lags == pytest.approx(middles, abs=8)  # what is loud in a second is anywhere in it
+
+
+def test_a_second_in_which_the_robot_is_silent_keeps_the_lag(said):
+    paused = said.copy()
+    paused[3 * RATE : 5 * RATE] = 0.0
+    found = believe(record(paused), paused)
+    assert found.lags == pytest.approx([DELAY] * 8, abs=2) and found.certain.size == 8
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.01, 0.3])
+def test_too_little_or_silence_is_no_lag(said, seconds):
+    count = round(seconds * RATE)
+    assert believe(np.zeros(count, np.float32), said).lag is None
+    assert believe(said[:count], np.zeros(RATE, np.float32)).lag is None
