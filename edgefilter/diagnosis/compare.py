@@ -106,7 +106,7 @@ def compare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     Notes
     -----
     Excess is the power of recording minus prediction, whitened by the fan's power spectral density, over the fan's own:
-    0 dB where nothing is left to explain. A constant lag of up to MAX_OFFSET seconds either way and the ordinary
+    0 dB where nothing is left to explain. A constant lag of up to 3 s either way and the ordinary
     tolerances of path and fan are taken out.
 
     Examples

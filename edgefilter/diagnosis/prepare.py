@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
+from edgefilter.alignment.belief import Belief, absent, believe
 from edgefilter.calibration.from_recording import TAIL_S
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.fractional_delay import delayed
@@ -22,15 +23,12 @@ from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.lag_track import track_lag
 from edgefilter.echo.measurement import STEADY_DB, Measurement, whiten
 from edgefilter.echo.model import EchoModel
-from edgefilter.echo.recording import MAX_OFFSET, fitted_blocks, paired
-from edgefilter.errors import SignalError
+from edgefilter.echo.recording import fitted_blocks, paired
 from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples, as_samples
 
 FRAME, HOP = StftConfig.n_fft, StftConfig.hop
 """Samples of the frames that a prediction is judged in, those of the running filter."""
-STANDS_OUT = 12.0
-"""Height of a correlation over the root mean square of all its lags from which a lag is true."""
 TRACK_REACH = 1600
 """Samples (0.1 s) by which the lag may move away from that of the whole recording and still be followed."""
 SILENCE_DB = -15.0
@@ -116,10 +114,14 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     predicted = model.predict(delayed(x, start))
     known = floored(model.expected_noise(profile.noise_psd)).astype(np.float32)
     white_y = whiten(y, known)
-    offset = starting_offset(whiten(predicted, known), white_y)
+    white = whiten(predicted, known)
+    believed = believe(white_y, white)
+    if believed.lag is None:
+        raise absent(x)
+    offset = starting_offset(white, white_y, believed.lag)
     if model.timed:  # a clock that drifts has drifted further, or less, by the time that the offset takes
-        offset += starting_offset(whiten(model.predict(delayed(x, start + offset)), known), white_y)
-    pieces = utterance_lags(x, predicted, y, known, offset)
+        offset += starting_offset(whiten(model.predict(delayed(x, start + offset)), known), white_y, 0)
+    pieces = utterance_lags(x, white, white_y, believed, offset)
     begin, end = known_span(x, start + pieces[0][2], start + pieces[-1][2])
     shifted = (
         delayed(np.where((np.arange(n) >= first) & (np.arange(n) < last), x, np.float32(0)), start + lag)
@@ -173,15 +175,14 @@ def ordinary_distortion(profile: Profile, predicted: Samples) -> tuple[tuple[Sam
     return (((ORDINARY * known.expected(voice)).astype(np.float32), known.colour),)
 
 
-def starting_offset(predicted: Samples, recording: Samples) -> float:
-    """Samples by which recording (n,) lags behind predicted (n,) at its beginning, both whitened.
+def starting_offset(predicted: Samples, recording: Samples, lag: int) -> float:
+    """Samples by which recording (n,) lags behind predicted (n,) at its beginning, both whitened. lag: the one that is believed.
 
     Over the whole of it where the lag is constant; where it moves by more than 0.3 samples (drift, jumps, a changed path),
     over the first seconds in which it holds still, so that what happens later is left in the residual. Where several
-    reflections are about as loud it only seems to move, and these seconds speak for the lag of the whole. Raises
-    SignalError where no lag stands out.
+    reflections are about as loud it only seems to move, and these seconds speak for the lag of the whole.
     """
-    whole, window, moves = find_offset(predicted, recording), SAMPLE_RATE, 0.3
+    whole, window, moves = finely(predicted, recording, lag), SAMPLE_RATE, 0.3
     track = track_lag(delayed(predicted, whole), recording, None, window, TRACK_REACH)
     clear = track.correlation > 0.5 * track.correlation.max(initial=0.0)
     if np.count_nonzero(clear) < 4:
@@ -202,19 +203,12 @@ def starting_offset(predicted: Samples, recording: Samples) -> float:
     return first + top(cross, n, away if spread > moves and abs(highest_at - away) < 2 else 0.0)
 
 
-def find_offset(predicted: Samples, recording: Samples) -> float:
-    """Samples, to a few thousandths, by which recording (n,) lags behind predicted (n,): the top of their correlation.
-
-    Raises SignalError where no lag stands out.
-    """
+def finely(predicted: Samples, recording: Samples, lag: int) -> float:
+    """A lag of recording (n,) behind predicted (n,), near the one that is believed, to a few thousandths of a sample."""
     n = fft.next_fast_len(2 * recording.size, real=True)
-    cross = likely_cross(predicted, recording, n)
-    lag, height = highest(correlation_near(cross, n, min(int(MAX_OFFSET * SAMPLE_RATE), recording.size - 1)))
-    if height < STANDS_OUT:
-        raise SignalError(
-            "the recording does not contain the reference at any lag up to 3 s: are both of the same utterance?"
-        )
-    return top(cross, n, float(lag))
+    cross = likely_cross(delayed(predicted, lag), recording, n)
+    at, _ = highest(correlation_near(cross, n, min(TRACK_REACH, recording.size - 1)))
+    return lag + top(cross, n, at)
 
 
 def known_span(x: Samples, first_lag: float, last_lag: float) -> tuple[int, int]:
@@ -237,30 +231,25 @@ def known_span(x: Samples, first_lag: float, last_lag: float) -> tuple[int, int]
 
 
 def utterance_lags(
-    x: Samples, predicted: Samples, recording: Samples, psd: Samples, offset: float
+    x: Samples, predicted: Samples, recording: Samples, believed: Belief, offset: float
 ) -> list[tuple[int, int, float]]:
     """First sample, end and lag of the stretches of x (n,) that share a lag; all of it with `offset` where all do.
 
-    predicted: for the reference x without an offset. A player starts each utterance anew, so its lag may be another
-    after a pause of PAUSE_S; a difference of less than LAG_STEP is no new start but left for the effects to explain.
+    predicted: for the reference x without an offset, and recording, both whitened; believed: of these. A player starts each
+    utterance anew, so its lag may be another after a pause of PAUSE_S; a difference of less than LAG_STEP is no new start
+    but left for the effects to explain.
     """
-    block, reach = SAMPLE_RATE // 50, int(MAX_OFFSET * SAMPLE_RATE)
+    block = SAMPLE_RATE // 50
     level = all_block_power(x, block)
     loud = np.flatnonzero(level > 10**-4.5 * level.max(initial=0.0))
     gaps = np.flatnonzero(np.diff(loud) > 50 * PAUSE_S)
     begins = [0, *(int(loud[gap + 1]) * block for gap in gaps)]
-    white, sought = whiten(predicted, psd), whiten(recording, psd)
     pieces: list[tuple[int, int, float]] = []
     for begin, end in zip(begins, [*begins[1:], x.size], strict=True):
         lag = pieces[-1][2] if pieces else offset
-        if len(begins) > 1 and end - begin > SAMPLE_RATE // 2:
-            near = slice(max(begin - reach, 0), end + reach)
-            inside = (np.arange(x.size)[near] >= begin) & (np.arange(x.size)[near] < end)
-            try:
-                own = find_offset(white[near] * inside, sought[near])
-            except SignalError:
-                own = lag
-            lag = own if abs(own - lag) > LAG_STEP else lag
+        own = believed.of(begin, end).lag
+        if own is not None and abs(own - lag) > LAG_STEP:
+            lag = finely(predicted * ((np.arange(x.size) >= begin) & (np.arange(x.size) < end)), recording, own)
         if pieces and lag == pieces[-1][2]:
             pieces[-1] = (pieces[-1][0], end, lag)
         else:

@@ -1,4 +1,4 @@
-"""A recording of the robot beside its reference: its least length, its largest lag, the samples that are fitted on."""
+"""A recording of the robot beside its reference: its least length, the samples that are fitted on."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from edgefilter.dsp.lag import one_signal
 from edgefilter.errors import SignalError
 from edgefilter.types import SAMPLE_RATE, Samples, as_samples
 
-MIN_SECONDS, MAX_OFFSET = 1.0, 3.0
-"""Seconds of the shortest recording, two BLOCKs, one to fit on and one to test; and by which it may lag behind or lead its reference."""
+MIN_SECONDS = 1.0
+"""Seconds of the shortest recording, two BLOCKs, one to fit on and one to test."""
 BLOCK = SAMPLE_RATE // 2
 """Samples of the blocks that are fitted and tested on in turn."""
 

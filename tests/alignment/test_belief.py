@@ -67,3 +67,10 @@ def test_too_little_or_silence_is_no_lag(said, seconds):
     count = round(seconds * RATE)
     assert believe(np.zeros(count, np.float32), said).lag is None
     assert believe(said[:count], np.zeros(RATE, np.float32)).lag is None
+
+
+def test_one_word_in_common_makes_two_recordings_no_pair():
+    said, other, word = voice(24.0), record(voice(24.0, seed=9)), slice(8 * RATE, 9 * RATE)
+    other[word] += 0.3 * record(said)[word]
+    assert believe(other[word], said[word]).certain.size == 1
+    assert believe(other, said).lag is None

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from edgefilter.alignment.belief import believe
 from edgefilter.diagnosis.precision import precision
 from edgefilter.diagnosis.prepare import utterance_lags
 from edgefilter.diagnosis.probe import Inquiry
@@ -67,7 +68,8 @@ def test_each_utterance_of_a_player_that_starts_anew_has_its_own_lag(later):
     heard = 1e-4 * rng.standard_normal(said.size)
     heard[100 : 5 * second] += said[: 5 * second - 100]
     heard[5 * second :] += np.roll(said, 100 + later)[5 * second :]
-    found = utterance_lags(said, said, heard.astype(np.float32), np.full(601, 1e-12, np.float32), 100.0)
+    heard = heard.astype(np.float32)
+    found = utterance_lags(said, said, heard, believe(heard, said), 100.0)
     assert [round(lag) for _, _, lag in found] == ([100] if later == 0 else [100, 100 + later])
     assert found[0][0] == 0 and found[-1][1] == said.size
     assert all(6 * second - 1000 < first <= 6 * second for first, _, _ in found[1:])
