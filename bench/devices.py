@@ -1,8 +1,8 @@
 r"""Every real device in one table, a row a device: nothing is known beforehand, nothing is calibrated.
 
-    OMP_NUM_THREADS=1 python -m bench devices RECORDINGS --speech HUMAN --whisper WHISPER --output PATH
+    OMP_NUM_THREADS=1 python -m bench devices RECORDINGS ... --speech HUMAN --whisper WHISPER --output PATH
 
-RECORDINGS holds pairs NAME_lpb (what the loudspeaker was sent) and NAME_mic, 16 kHz mono. Where the robot talks alone,
+Each folder RECORDINGS holds pairs NAME_lpb (what the loudspeaker was sent) and NAME_mic, 16 kHz mono. Where the robot talks alone,
 humans of --speech are laid on: on a device's only recording at a level and after a time drawn from --ser and --before;
 on a device of many recordings (DEVICE_00, ...) at each of --levels, on the half that is kept to report on. The same
 recordings whole tell how far the robot alone is lowered, and every speech_started in them is false. Pairs in which both
@@ -22,14 +22,14 @@ import numpy as np
 
 from bench import recordings, results, runner, systems
 from bench.evaluate import names, numbers, of, slim
-from bench.metrics import difference, mean
+from bench.metrics import IN_TIME_S, difference, mean, per_hour
 from bench.recordings import Cells, Clip, Recording
 from bench.systems import System
 
 DEFAULT = ("unfiltered", *(f"{engine}-uncalibrated{way}" for way in ("", "-learning") for engine in systems.OWN),
            *systems.PEERS, "clean")  # fmt: skip
-TUNED_ON = "F_i0k*,1N-e5*,yw9vi*,0B-YT*,0sjDo*"
-"""The devices of the shared recordings that are there to tune on."""
+TUNED_ON = "F_i0k*,1N-e5*,yw9vi*,0B-YT*,0sjDo*,gf_0sK*,gf_6558*,realaec*,nanless*,smird*,wade*"
+"""The devices whose recordings were there to look at and to tune on."""
 SOON_S = 0.5
 """A human who interrupts is to be noticed by then."""
 AHEAD_DB = 1.0
@@ -43,7 +43,7 @@ and reference as the engines do."""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("recordings", type=Path, metavar="RECORDINGS")
+    add("recordings", type=Path, nargs="+", metavar="RECORDINGS")
     add("--speech", type=Path, required=True, metavar="DIR", help="humans, with a transcripts.tsv")
     add("--systems", type=names, default=list(DEFAULT), metavar="A,B,...", help="default: %(default)s")
     add("--tuned-on", type=names, default=names(TUNED_ON), metavar="A,B,...", help="default: %(default)s")
@@ -55,16 +55,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> str:
-    here, absent = systems.present(systems.chosen(options.systems))
+    able, absent = systems.present(systems.chosen(options.systems))
+    here = [one for one in able if one.kind != "detector"]
     clips = find_clips(options)
-    data = {"RECORDINGS": [options.recordings], "HUMAN": [options.speech]}
+    data = {"RECORDINGS": options.recordings, "HUMAN": [options.speech]}
     made_with = results.stamp(data, [one.name for one in here], {"WHISPER": options.whisper})
     setup = runner.Setup(options.cache, options.whisper)
-    rows = runner.run(clips, here, setup, options.jobs, options.scheduler)
+    rows = runner.run(clips, able, setup, options.jobs, options.scheduler)
     tuned_on = {clip.room for clip in clips if any(fnmatch(clip.room, one) for one in options.tuned_on)}
     kept, tuned = ([row for row in rows if (row["room"] in tuned_on) == told] for told in (False, True))
     parts = (("headline", "Devices kept apart", kept), ("tuned-on", "Devices tuned on", tuned))
     tables = [overview(*part, here) for part in parts]
+    tables += [who_interrupts(name, title, own, able) for name, title, own in parts]
     laid, alone = ([row for row in rows if row["set"] == part] for part in ("laid", "alone"))
     tables += [by_device("si_sdr", "SI-SDR of the human laid on, dB", laid, here, 1, tuned_on),
                by_device("capped", "Words wrong, %", laid, here, 0, tuned_on),
@@ -78,17 +80,19 @@ def run(options: argparse.Namespace) -> str:
 def find_clips(options: argparse.Namespace) -> list[Clip]:
     """Humans laid on, robots alone, and pairs as recorded; a clip's room is its device."""
     found: dict[str, list[Recording]] = {}
-    for one in recordings.find_recordings(options.recordings):
+    for one in [one for folder in options.recordings for one in recordings.find_recordings(folder)]:
         if not one.tuned_on:
             found.setdefault(one.device, []).append(one)
     clips: list[Clip] = []
     for device, own in list(found.items())[:: options.every][: options.limit]:
         alone = [one for one in own if one.kind == "farend"]
-        if alone and alone[0].name.removeprefix(f"{device}_").isdigit():
+        if alone and alone[0].many:
             cells = Cells(options.levels, (min(options.before),))
             laid = recordings.lay(alone, options.speech, cells, options.cases, options.seed)
         else:
-            laid = [human for one in alone for human in recordings.lay_once(
+            shortest = recordings.UTTERANCE_S[0] + recordings.TAIL_S
+            long = [one for one in alone if one.span is None or one.seconds >= shortest]
+            laid = [human for one in long for human in recordings.lay_once(
                 one, options.speech, options.humans, options.ser, options.before, options.seed)]  # fmt: skip
         sets = {"laid": recordings.laid_clips(laid, options.speech, device)}
         sets["alone"] = (recordings.recorded_clip(one) for one in alone)
@@ -121,6 +125,38 @@ def overview(name: str, title: str, rows: Sequence[dict], here: Sequence[System]
                       mean(per_device(laid, "capped"), "capped"), mean(lowered, "erle_db"),
                       min((row["erle_db"] for row in lowered), default=None), starts(alone), soon(laid), *less])  # fmt: skip
     return results.table(name, f"{title}: {devices}, a human laid on {with_human}", columns, cells if devices else [])
+
+
+def who_interrupts(name: str, title: str, rows: Sequence[dict], able: Sequence[System]) -> dict:
+    """A row for each system and detector that tells who speaks: false starts, and how soon the humans are noticed."""
+    cells = []
+    for one in able:
+        alone, laid = (of(rows, one.name, part) for part in ("alone", "laid"))
+        told, heard = ([row for row in part if key in row] for part, key in ((alone, "false_starts"), (laid, "early")))
+        if not told:
+            continue
+        count, hours = sum(row["false_starts"] for row in told), sum(row["duration"] for row in told) / 3600
+        delays = [np.inf if row["delay_s"] is None else 1000 * row["delay_s"] for row in heard if not row["early"]]
+        soon = [sum(delay <= 1000 * limit for delay in delays) for limit in (IN_TIME_S, SOON_S)]
+        median = float(np.quantile(delays, 0.5, method="higher")) if delays else None
+        cells.append([one.title, count, per_hour(count, hours), *soon, median if median != np.inf else "never",
+                      sum(np.isinf(delays)), len(heard) - len(delays)])  # fmt: skip
+    minutes = (
+        sum({row["clip"]: row["duration"] for row in rows if row["set"] == "alone" and "duration" in row}.values()) / 60
+    )
+    humans = len({row["clip"] for row in rows if row["set"] == "laid"})
+    columns = [
+        "",
+        "false starts",
+        ("an hour", 0),
+        f"noticed in {IN_TIME_S} s",
+        f"in {SOON_S} s",
+        ("median, ms", 0),
+        "never",
+        "already on",
+    ]
+    text = f"{minutes:.1f} minutes of the robot alone, {humans} humans. A detector hears what stands behind its name, as late as that comes."
+    return results.table(f"interrupts-{name}", f"What interrupts the robot. {title}", columns, cells, text)
 
 
 def starts(alone: Sequence[dict]) -> str | None:

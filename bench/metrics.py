@@ -9,6 +9,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from scipy import stats
 
 from bench.cache import Cache
 from bench.recogniser import Recogniser, word_errors
@@ -192,6 +193,12 @@ def in_time(found: Mapping) -> bool:
 
 def starts(events: Sequence[Event]) -> int:
     return sum(event.kind == "speech_started" for event in events)
+
+
+def per_hour(count: int, hours: float) -> dict:
+    """So many events in so many hours as a rate, with the exact Poisson interval."""
+    low, high = stats.chi2.ppf([0.025, 0.975], [2 * count or 1, 2 * count + 2]) / 2 / hours
+    return {"mean": count / hours, "low": float(low) if count else 0.0, "high": float(high)}
 
 
 def replay(probability: Sequence[float | None], hop: int, threshold: float) -> list[Event]:

@@ -1,8 +1,9 @@
 """Every kind of recording: generated conversations, pairs of a real device, humans laid on those without one.
 
 Pairs are files NAME_lpb (what the loudspeaker was sent) and NAME_mic, 16 kHz mono. A name holds who talks: doubletalk,
-nearend, farend; without such a word the robot talks alone, as in farend. DEVICE_00, DEVICE_01, ... are many recordings
-of one device: the first half of them is to tune on, the second to report on.
+nearend, farend; without such a word the robot talks alone, as in farend. A table files.tsv beside the files, or beside their
+folder, says when: columns name, far_end_alone_s, double_talk_s, near_end_alone_s ("2-14"). DEVICE_00, DEVICE_01, ... are many
+recordings of one device: the first half of them is to tune on, the second to report on.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ from edgefilter.types import SAMPLE_RATE, Samples
 
 AUDIO = (".wav", ".flac", ".ogg")
 KINDS = ("doubletalk", "farend", "nearend")
+SPANS = {"doubletalk": "double_talk_s", "farend": "far_end_alone_s", "nearend": "near_end_alone_s"}
+"""Columns of files.tsv with the seconds in which these talk."""
 LENGTHS_S = 1.0
 """Seconds by which a loopback may differ from its microphone: recorders of real devices stop one after the other."""
 UTTERANCE_S = (3.0, 10.0)
@@ -166,7 +169,8 @@ def progress(items: Sequence[Item], unit: str = "recording", name: str | None = 
 class Recording:
     """A pair of files: what the loudspeaker was sent and what the microphone recorded.
 
-    kind: one of KINDS. device: whose recording it is. tuned_on: of the first half of a device's many recordings.
+    kind: one of KINDS. device: whose recording it is. many: one of a device's many; tuned_on: of their first half. span: samples
+    that are taken, None for all. Of several microphones the first is heard.
     """
 
     name: str
@@ -174,15 +178,22 @@ class Recording:
     ref_path: Path
     mic_path: Path
     device: str = ""
+    many: bool = False
     tuned_on: bool = False
+    span: tuple[int, int] | None = None
+
+    @property
+    def seconds(self) -> float:
+        return self.signals().mic.size / SAMPLE_RATE
 
     def signals(self) -> Signals:
-        mic, ref = read(self.mic_path), read(self.ref_path)
+        mic, ref = read(self.mic_path, several=True), read(self.ref_path)
         if not mic.size or abs(mic.size - ref.size) > LENGTHS_S * SAMPLE_RATE:
             found = f"{mic.size / SAMPLE_RATE:.2f} s of microphone and {ref.size / SAMPLE_RATE:.2f} s of loopback"
             wanted = f"within {LENGTHS_S:.0f} s as much: take the files of one recording"
             raise UsageError(f"{self.name}: {found}, expected {wanted}")
-        return Signals(mic, np.pad(ref, (0, max(mic.size - ref.size, 0)))[: mic.size])
+        taken = slice(*self.span) if self.span else slice(None)
+        return Signals(mic[taken], np.pad(ref, (0, max(mic.size - ref.size, 0)))[: mic.size][taken])
 
 
 def find_recordings(folder: Path) -> list[Recording]:
@@ -196,13 +207,36 @@ def find_recordings(folder: Path) -> list[Recording]:
         if name + ending not in files:
             wanted = "expected both: add it or remove the other"
             raise UsageError(f"{folder} holds {name} without its {ending} file, {wanted}")
-    devices = {name: re.sub(rf"_(\d+|({'|'.join(KINDS)}).*)$", "", name) for name in names}
-    found = []
+    devices = {name: re.sub(rf"_(\d\d?|({'|'.join(KINDS)}).*)$", "", name) for name in names}
+    found, told = [], _told(folder)
     for name in names:
-        numbered = [other for other in names if devices[other] == devices[name] and re.search(r"_\d+$", other)]
-        kind = next((kind for kind in KINDS if kind in name), "farend")
-        first_half = name in numbered[: (len(numbered) + 1) // 2] and len(numbered) > 1
-        found.append(Recording(name, kind, files[f"{name}_lpb"], files[f"{name}_mic"], devices[name], first_half))
+        numbered = [other for other in names if devices[other] == devices[name] and re.search(r"_\d\d$", other)]
+        many = name in numbered and len(numbered) > 1
+        first_half = many and name in numbered[: (len(numbered) + 1) // 2]
+        guess: dict[str, tuple[int, int] | None] = {next((kind for kind in KINDS if kind in name), "farend"): None}
+        spans = told.get(name) or guess
+        for kind, span in spans.items():
+            own = name if len(spans) == 1 else f"{name} {kind}"
+            pair = files[f"{name}_lpb"], files[f"{name}_mic"]
+            found.append(Recording(own, kind, *pair, devices[name], many, first_half, span))
+    return found
+
+
+def _told(folder: Path) -> dict[str, dict[str, tuple[int, int] | None]]:
+    """What files.tsv says of a folder's recordings: the samples in which these talk, double talk with all before it."""
+    table = next((path for path in (folder / "files.tsv", folder.parent / "files.tsv") if path.is_file()), None)
+    if table is None:
+        return {}
+    found: dict[str, dict[str, tuple[int, int] | None]] = {}
+    with table.open(encoding="utf-8", newline="") as lines:
+        for row in csv.DictReader(lines, delimiter="\t"):
+            place, _, name = row["name"].rpartition("/")
+            seconds = {
+                kind: [float(s) for s in row[column].split("-")] for kind, column in SPANS.items() if row.get(column)
+            }
+            if place in ("", folder.name):
+                found[name] = {kind: (0 if kind == "doubletalk" else round(start * SAMPLE_RATE), round(end * SAMPLE_RATE))
+                               for kind, (start, end) in seconds.items()}  # fmt: skip
     return found
 
 
@@ -479,10 +513,10 @@ def named(clips: Iterable[Clip], name: str) -> list[Clip]:
     return [replace(clip, set=name) for clip in clips]
 
 
-def read(path: Path) -> Samples:
-    """Samples of a file, (n,); raises UsageError for another rate or more channels."""
-    samples, rate = soundfile.read(path, dtype="float32")
-    if rate != SAMPLE_RATE or samples.ndim != 1:
-        channels = 1 if samples.ndim == 1 else samples.shape[1]
-        raise UsageError(f"{path}: {rate} Hz, {channels} channels, expected {SAMPLE_RATE} Hz mono: convert it first")
-    return samples
+def read(path: Path, several: bool = False) -> Samples:
+    """Samples of a file, (n,); raises UsageError for another rate, or more channels. several: takes the first of them instead."""
+    samples, rate = soundfile.read(path, dtype="float32", always_2d=True)
+    if rate != SAMPLE_RATE or (samples.shape[1] > 1 and not several):
+        found = f"{rate} Hz, {samples.shape[1]} channels"
+        raise UsageError(f"{path}: {found}, expected {SAMPLE_RATE} Hz mono: convert it first")
+    return samples[:, 0].copy()

@@ -17,7 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench import peers, results, voicefilter
+from bench import detectors, peers, results, voicefilter
+from bench.detectors import DETECTORS
 from bench.recordings import Clip, NotHere, Signals
 from edgefilter import EgoFilter, Event, PathLearner, Profile, calibrate
 from edgefilter.calibration.calibrate import FARTHEST
@@ -38,6 +39,8 @@ ARRAYS = (2, 3, 4)
 """Numbers of microphones, of conversations that have so many."""
 TRUE_LAG = "-true-lag"
 PEERS = {"speexdsp": "SpeexDSP", "speexdsp-suppressed": "SpeexDSP with its suppressor", "aec3": "WebRTC AEC3"}
+HEARD = ("unfiltered", "speexdsp-suppressed", "aec3", "crnn-uncalibrated")
+"""Rows behind which a detector of speech can stand, as "ROW+DETECTOR" or "ROW+DETECTOR-held"."""
 ABSENT = {
     "paper-ss-voicefixer": ("SS after post-filtering (VoiceFixer)", "no package carries VoiceFixer's weights"),
     "dtln-aec": ("DTLN-aec", "no package carries its weights"),
@@ -66,7 +69,7 @@ class Output(NamedTuple):
 class System:
     """A row.
 
-    kind: unfiltered, paper, own, peer or bound. knows: what it had besides microphone and reference. latency_ms: from
+    kind: unfiltered, paper, own, peer, bound or detector. knows: what it had besides microphone and reference. latency_ms: from
     its windows, None where it answers only at the end. missing: raises NotHere where it cannot run here. code: files
     and versions on which its output depends. model: a network that no engine brings.
     """
@@ -106,6 +109,9 @@ def catalogue(networks: Mapping[str, Path] | None = None) -> dict[str, System]:
     rows += [*_paper(), *(_own(engine, way) for way in WAYS for engine in OWN), *_arrays(), *_peers()]
     rows += [_own("crnn", "", path, f"crnn:{name}") for name, path in (networks or {}).items()]
     rows += _bounds()
+    rows += [
+        _behind(one, name, held) for one in rows if one.name in HEARD for name in DETECTORS for held in (False, True)
+    ]
 
     def refuse(why: str) -> object:
         raise NotHere(why)
@@ -116,12 +122,12 @@ def catalogue(networks: Mapping[str, Path] | None = None) -> dict[str, System]:
 
 
 def chosen(names: Sequence[str], networks: Mapping[str, Path] | None = None) -> list[System]:
-    """The rows of these names, all without any. Raises UsageError for a name that no row has."""
+    """The rows of these names; without any, all but the detectors. Raises UsageError for a name that no row has."""
     rows = catalogue(networks)
     for name in names:
         if name not in rows:
             raise UsageError(f"unknown system '{name}': choose some of {', '.join(rows)}")
-    return [one for one in rows.values() if not names or one.name in names]
+    return [one for one in rows.values() if one.name in names or (not names and one.kind != "detector")]
 
 
 def present(rows: Iterable[System]) -> tuple[list[System], dict[str, str]]:
@@ -350,6 +356,24 @@ def _peers() -> list[System]:
             knows, ms = ("the true lag" if ending else "neither"), 1000 * samples / SAMPLE_RATE
             found.append(System(name + ending, title + told, "peer", run, knows, ms, probe, partial(_files, peers)))
     return found
+
+
+def _behind(base: System, name: str, held: bool) -> System:
+    """A detector of speech that hears what another row makes, as late as that comes."""
+    detector = DETECTORS[name]
+    late = round((base.latency_ms or 0.0) * SAMPLE_RATE / 1000)
+
+    def run(clip: Clip) -> Output:
+        out = clip.once(base.name, lambda: base.run(clip).samples)
+        found = detectors.probabilities(detector, out)
+        return Output(out, list(detectors.events(detector, found, held, late)), found, detector.hop)
+
+    def missing() -> object:
+        return base.missing(), detector.start()
+
+    title = f"{detector.title}{f' held {detectors.HELD_S:g} s' if held else ''} behind {base.title}"
+    code = lambda: base.code() + _files(detectors) + str(versions([detector.package]))  # noqa: E731
+    return System(f"{base.name}+{name}{'-held' * held}", title, "detector", run, base.knows, None, missing, code)
 
 
 def linear(clip: Clip) -> Samples:

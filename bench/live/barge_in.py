@@ -25,11 +25,10 @@ from pathlib import Path
 
 import jiwer
 import numpy as np
-from scipy import stats
 
 from bench import results
 from bench.cache import Cache
-from bench.metrics import IN_TIME_S, THRESHOLDS, counted, first_sound, in_time, mean, noticed, replay, starts
+from bench.metrics import IN_TIME_S, THRESHOLDS, counted, first_sound, in_time, mean, noticed, per_hour, replay, starts
 from bench.recogniser import Recogniser, normalise, word_errors
 from bench.recordings import CALIBRATION, find_recordings, progress
 from bench.simulate.conversations import Scene, make_scene, read_clips, read_voices
@@ -341,9 +340,7 @@ def false_stops(rows: Sequence[Mapping]) -> list:
     """Robots, minutes of speech and of distinct speech, voices, stops, and stops an hour with the exact Poisson interval."""
     hours, count = sum(row["speech_s"] for row in rows) / 3600, sum(row["stops"] for row in rows)
     distinct_s = sum({name: seconds for row in rows for name, seconds in row["said"]}.values())
-    low, high = stats.chi2.ppf([0.025, 0.975], [2 * count or 1, 2 * count + 2]) / 2 / hours
-    rate = {"mean": count / hours, "low": float(low) if count else 0.0, "high": float(high)}
-    return [len(rows), 60 * hours, distinct_s / 60, len({row["voice"] for row in rows}), count, rate]
+    return [len(rows), 60 * hours, distinct_s / 60, len({row["voice"] for row in rows}), count, per_hour(count, hours)]
 
 
 def curve(found: Sequence[Mapping], alone: Sequence[Mapping], start: str) -> list[dict]:

@@ -52,6 +52,23 @@ def test_the_first_half_of_a_devices_recordings_is_to_tune_on_and_names_tell_who
     assert kinds["x_doubletalk"] == "doubletalk"
 
 
+def test_a_table_says_who_talks_when_and_the_first_of_several_microphones_is_heard(pairs: Path) -> None:
+    (pairs.parent / "files.tsv").write_text(
+        "name\tfar_end_alone_s\tdouble_talk_s\tnear_end_alone_s\n"
+        f"{pairs.name}/x_doubletalk\t0.5-1\t1-1.5\t\nother/device1_00\t0-1\t\t\n"
+    )
+    path = pairs / "x_doubletalk_mic.wav"
+    whole = sf.read(path, dtype="float32")[0]
+    sf.write(path, np.stack((whole, -whole), axis=1), 16000, subtype="FLOAT")
+    found = [one for one in find_recordings(pairs) if one.device == "x" and "doubletalk" in one.name]
+    assert [(one.name, one.kind, one.seconds) for one in found] == [
+        ("x_doubletalk doubletalk", "doubletalk", 1.5),  # what comes before is heard as well
+        ("x_doubletalk farend", "farend", 0.5),
+    ]
+    assert np.array_equal(found[1].signals().mic, whole[8000:16000])
+    assert {one.span for one in find_recordings(pairs) if one.device == "device1"} == {None}
+
+
 def test_the_same_seed_lays_the_same_humans(pairs: Path, speech: Path) -> None:
     assert laid(pairs, speech) == laid(pairs, speech) != laid(pairs, speech, seed=4)
 
