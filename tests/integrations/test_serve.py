@@ -12,6 +12,7 @@ import time
 import tracemalloc
 import weakref
 from contextlib import asynccontextmanager
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -508,12 +509,12 @@ def test_a_client_that_says_nothing_is_let_go(monkeypatch):
 
 def skipping(step, size):
     """400 messages of the microphone whose counter stands still; a step of 2 leaves out every second number."""
-    return [HEADER.pack(MICROPHONE, (step * k) % 65536, 0) + bytes(size) for k in range(400)]
+    return (HEADER.pack(MICROPHONE, (step * k) % 65536, 0) + bytes(size) for k in range(400))
 
 
 def references(size):
     """100 messages of a reference, each begins where the one before ends."""
-    return [HEADER.pack(REFERENCE, k, k * size // 2) + bytes(size) for k in range(100)]
+    return (HEADER.pack(REFERENCE, k, k * size // 2) + bytes(size) for k in range(100))
 
 
 ANNOUNCED = [json.dumps({"kind": "announce"}), pcm(np.full(500_000, 0.1))]
@@ -525,7 +526,7 @@ HOARDS = {
         references(3_900_000),
         "bytes wait for messages that are missing",
     ),
-    "a reference that runs ahead": ({"streams": "two"}, [HEADER.pack(0, 0, 0), *references(400_000)], "bytes wait"),
+    "a reference that runs ahead": ({"streams": "two"}, chain([HEADER.pack(0, 0, 0)], references(400_000)), "bytes wait"),
     "announcements": ({}, ANNOUNCED * 300, "more than 64 announced utterances or 300 s of them would"),
     "announcements of a word": (
         {},
