@@ -526,7 +526,11 @@ HOARDS = {
         references(3_900_000),
         "bytes wait for messages that are missing",
     ),
-    "a reference that runs ahead": ({"streams": "two"}, chain([HEADER.pack(0, 0, 0)], references(400_000)), "bytes wait"),
+    "a reference that runs ahead": (
+        {"streams": "two"},
+        chain([HEADER.pack(0, 0, 0)], references(400_000)),
+        "bytes wait",
+    ),
     "announcements": ({}, ANNOUNCED * 300, "more than 64 announced utterances or 300 s of them would"),
     "announcements of a word": (
         {},
