@@ -142,6 +142,7 @@ def test_every_device_has_its_row(pairs: Path, speech: Path, tmp_path: Path) -> 
     assert kept["linear, uncalibrated"][1]["mean"] == pytest.approx(ratios["device1"][1])
     lowered = {row[0]: row[1:] for row in table(part, "erle_db")["rows"]}
     assert lowered["device1"][0] == pytest.approx(0.0) and lowered["device1"][1] > 10  # an echo of one tap
+    assert [row[0] for row in table(part, "interrupts-headline")["rows"]] == ["crnn, uncalibrated"]
     assert [row[0] for row in table(part, "barge-in")["rows"]] == ["x (tuned on)", "device1"][::-1]
     against = {row[0]: row[3]["mean"] for row in table(part, "peers")["rows"]}
     names = table(part, "si_sdr")["columns"][1:]
@@ -150,7 +151,7 @@ def test_every_device_has_its_row(pairs: Path, speech: Path, tmp_path: Path) -> 
 
 
 def test_devices_that_only_hold_a_human_have_no_humans_laid_on(pairs: Path, speech: Path) -> None:
-    given = Namespace(recordings=pairs, speech=speech, levels=(-10.0,), before=(2.0, 3.0), cases=1, humans=2)
+    given = Namespace(recordings=[pairs], speech=speech, levels=(-10.0,), before=(2.0, 3.0), cases=1, humans=2)
     given.ser, given.seed, given.every, given.limit = (-14.0, -6.0), 1, 1, None
     found = devices.find_clips(given)
     sets = [(clip.set, clip.room) for clip in found]

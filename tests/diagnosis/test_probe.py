@@ -366,7 +366,7 @@ def test_what_nothing_predicts_is_said_and_named_by_none(written: Path, capsys) 
     ("damage", "said"),
     [
         ("silent", "recording {folder}/silent.wav is silent"),
-        ("other", "does not contain the reference at any lag"),
+        ("other", "does not contain the reference (of"),
         ("sound", "excitation {folder}/probe.wav is not the one that {folder}/probe.wav.json was written with"),
         ("profile", "profile {folder}/robot.npz is not the one"),
         ("question", "{folder}/probe.wav.json is not there or holds no question"),
