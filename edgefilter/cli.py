@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, get_args
 
 from edgefilter import __version__
 from edgefilter.commands.display import STATUS_LEGEND, own_words_only
@@ -23,7 +23,7 @@ from edgefilter.echo.user_effects import load_effect
 from edgefilter.engines import ENGINES, HAVE_MODEL
 from edgefilter.errors import EdgefilterError, UsageError, printable
 from edgefilter.filter.barge_in import BargeInSettings
-from edgefilter.types import ALL_CHANNELS, MOST_MICROPHONES
+from edgefilter.types import ALL_CHANNELS, MOST_MICROPHONES, SoundFor
 
 ENGINE = {
     "default": "auto",
@@ -115,6 +115,8 @@ def _run(commands: argparse._SubParsersAction) -> None:
     option("--reference-channel", type=channel, metavar="N", help=told)
     option("--profile", metavar="P.npz", help="calibrated robot, made by 'edgefilter calibrate'")
     option("--engine", **ENGINE)
+    told = "for a recogniser, or to listen to, lower where nobody speaks (default: %(default)s)"
+    option("--sound", choices=get_args(SoundFor), default="recognise", help=told)
     option("--model", metavar="FILE.onnx", help=f"network for {' or '.join(HAVE_MODEL)} in place of its own")
     told = (
         "computing time for a hop, kept in 99 of 100 hops: auto and a live run choose engines by it (live default: 8)"

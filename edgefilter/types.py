@@ -134,6 +134,9 @@ class Event:
     sound: Turn | None = field(default=None, compare=False, repr=False)
 
 
+SoundFor: TypeAlias = Literal["recognise", "listen"]
+"""For whom the human's sound is: a recogniser, or somebody in a call, a level meter, a detector of speech."""
+
 AlignmentState: TypeAlias = Literal["idle", "announced", "begun", "unfound", "coarse", "lost", "locked"]
 """What is known of the utterance that may be heard now (edgefilter.alignment.delay_line.Aligned)."""
 
@@ -210,15 +213,16 @@ class ArrayStats(TypedDict):
 class Stats(TypedDict):
     """What EgoFilter.stats() returns, ready for JSON.
 
-    engine, engine_reason: the one at work, and why it was chosen. engines: those that can take turns. model: what a
-    network's file says of itself, None without one. latency_ms: algorithmic, None for an engine that needs the whole
-    recording. samples: taken in so far. alignment, linear_stage: None for engines that go without. array: None with one
-    microphone. learning: what the learner did, None without one.
+    engine, engine_reason: the one at work, and why it was chosen. engines: those that can take turns. output: which sound
+    process returns. model: what a network's file says of itself, None without one. latency_ms: algorithmic, None for an
+    engine that needs the whole recording. samples: taken in so far. alignment, linear_stage: None for engines that go
+    without. array: None with one microphone. learning: what the learner did, None without one.
     """
 
     engine: str
     engine_reason: str
     engines: list[str]
+    output: SoundFor
     model: dict[str, object] | None
     latency_ms: float | None
     samples: int

@@ -197,7 +197,7 @@ def make_filter(args: argparse.Namespace, live: bool, profile: Profile | None) -
         engine, reason, budget_ms = choice.engine, choice.reason, choice.budget_ms
     learner = make_learner(args, live, profile)
     budget_ms, barge_in = budget_ms if live else None, BargeInSettings(confirm_s=args.confirm_s)
-    ego = EgoFilter(profile, engine, budget_ms, reason, args.model, barge_in, learner)
+    ego = EgoFilter(profile, engine, budget_ms, reason, args.model, barge_in, learner, output=args.sound)
     if profile is None and ego.engine_name in HAVE_LINEAR_STAGE:
         say(
             "no profile: the robot is not calibrated, loudspeaker and room are learned from its first seconds"

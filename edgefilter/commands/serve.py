@@ -15,6 +15,7 @@ from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.integrations.doors import is_own
 from edgefilter.learning.background import BackgroundLearner
 from edgefilter.profile.data import Profile
+from edgefilter.types import SoundFor
 
 STREAMS_PER_CORE = 4
 """Clients at a time unless --streams says otherwise: a third of what a core bears by computing time, 0.08 s a second of
@@ -36,10 +37,10 @@ def main(args: argparse.Namespace) -> None:
     cores = len(allowed_cores())
     streams = args.streams or STREAMS_PER_CORE * cores
 
-    def make_filter(learns: bool) -> EgoFilter:
+    def make_filter(learns: bool, output: SoundFor = "recognise") -> EgoFilter:
         learner = BackgroundLearner(profile) if learns else None
         settings = BargeInSettings(judge="network", confirm_s=args.confirm_s)
-        return EgoFilter(profile, args.engine, barge_in=settings, learn=learner)
+        return EgoFilter(profile, args.engine, barge_in=settings, learn=learner, output=output)
 
     make_filter(False)  # what cannot be made is said now, and what is slow to load is loaded
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from edgefilter.filter.echo_path import Learner
 from edgefilter.filter.stepping import Stepping
 from edgefilter.filter.stream import Stream
 from edgefilter.profile.data import Profile
-from edgefilter.types import SAMPLE_RATE, Event, Samples, Stats, as_samples
+from edgefilter.types import SAMPLE_RATE, Event, Samples, SoundFor, Stats, as_samples
 
 if TYPE_CHECKING:
     from edgefilter.engines.onnx_session import Model
@@ -58,6 +58,10 @@ class EgoFilter:
         Called in the same way with "speech_suspected", some 50 ms before a human's speech counts as begun, and with
         "speech_dismissed" where nobody spoke, 0.3 s later at most (`BargeInSettings.confirm_s`): a robot may lower its
         voice meanwhile.
+    output : str
+        Which of two sounds `process` returns; `other` gives the other one. "recognise": for a recogniser. "listen": for a
+        call, a level meter or a detector of speech; up to 14 dB lower where the engine hears nobody speak, and the same
+        from an engine that judges no speech. Events and turns do not depend on it.
 
     Attributes
     ----------
@@ -69,7 +73,7 @@ class EgoFilter:
     Raises
     ------
     UsageError
-        For an unknown engine, one that lacks its profile, or a model without an engine for it.
+        For an unknown engine, one that lacks its profile, a model without an engine for it, or another output.
     ProfileError, ModelError
         For a file that is damaged or of another version.
 
@@ -104,7 +108,10 @@ class EgoFilter:
         on_barge_in: Callable[[Event], object] | None = None,
         keep_channels: bool = False,
         on_suspicion: Callable[[Event], object] | None = None,
+        output: SoundFor = "recognise",
     ) -> None:
+        if output not in get_args(SoundFor):
+            raise UsageError(f"found output '{output}', expected one of {', '.join(get_args(SoundFor))}")
         if engine == "auto" and model is not None:
             raise UsageError(
                 f"found the model {model} without an engine for it: name one of {', '.join(engines.HAVE_MODEL)}"
@@ -126,7 +133,7 @@ class EgoFilter:
             else:
                 ladder = Ladder(climbable(best, self.profile))
         stepping = Stepping(best.stft.hop, ladder, budget_ms)
-        hooks = on_barge_in, keep_channels, on_suspicion
+        hooks = on_barge_in, keep_channels, on_suspicion, output
         self._stream = Stream(ladder or best, self.profile, stepping, barge_in, learn, *hooks)
 
     @property
@@ -202,6 +209,24 @@ class EgoFilter:
             than before or than the profile's, or after `flush`.
         """
         return self._stream.process(mic_block, ref_block)
+
+    def other(self) -> Samples:
+        """The other sound of the samples that the latest `process` or `flush` returned: see `output` of the class.
+
+        Returns
+        -------
+        ndarray of float32, shape (m,)
+            As many samples, with the same latency. Nothing before the first call.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> ego = EgoFilter(engine="bypass", output="listen")
+        >>> to_listen_to, to_recognise = ego.process(np.zeros(1000), np.zeros(1000)), ego.other()
+        >>> to_listen_to.shape == to_recognise.shape
+        True
+        """
+        return self._stream.other
 
     def robot_removed(self) -> Samples:
         """Each microphone with the robot's voice subtracted, for whoever wants to know where the human is.
@@ -300,6 +325,7 @@ class EgoFilter:
             "engine": self.engine_name,
             "engine_reason": self.engine_reason,
             "engines": [engine.name for engine in self._engines],
+            "output": self._stream.output,
             "model": model.describe() if model else None,
             "latency_ms": None if self.waits_for_end else 1000 * self.latency / SAMPLE_RATE,
             "samples": self._stream.samples_in,
@@ -354,6 +380,7 @@ def enhance(
     engine: str = "auto",
     model: str | Path | None = None,
     learn: Learner | None = None,
+    output: SoundFor = "recognise",
 ) -> Samples:
     """Filter a whole recording with its reference, by the same stream as live.
 
@@ -363,7 +390,7 @@ def enhance(
         What the microphone heard, or two to eight microphones on one clock; full scale +-1, 16 kHz.
     ref : ndarray of float, shape (n,)
         What the robot said, on the same sample counter.
-    profile, engine, model, learn
+    profile, engine, model, learn, output
         As of `EgoFilter`.
 
     Returns
@@ -387,5 +414,5 @@ def enhance(
     >>> bool(np.mean(left**2) < 0.01 * np.mean(heard[-16_000:] ** 2))
     True
     """
-    ego = EgoFilter(profile, engine, model=model, learn=learn)
+    ego = EgoFilter(profile, engine, model=model, learn=learn, output=output)
     return np.concatenate((ego.process(mic, ref), ego.flush()))

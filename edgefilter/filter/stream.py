@@ -20,7 +20,26 @@ from edgefilter.filter.reference_watch import ReferenceWatch
 from edgefilter.filter.stepping import Stepping
 from edgefilter.filter.turns import LONGEST_S, Turns, drop_sound
 from edgefilter.profile.data import Profile
-from edgefilter.types import SAMPLE_RATE, Event, EventKind, Frame, Output, Samples, Turn, as_microphones, as_samples
+from edgefilter.types import (
+    SAMPLE_RATE,
+    Event,
+    EventKind,
+    Frame,
+    Output,
+    Samples,
+    SoundFor,
+    Turn,
+    as_microphones,
+    as_samples,
+)
+
+NOTHING: Samples = np.zeros((2, 0), np.float32)
+"""No samples of the sound to recognise, and of the one to listen to."""
+NOBODY = 0.2
+"""Gain of the sound to listen to where surely nobody speaks, -14 dB. In 41 simulated conversations of validation speakers robots
+alone are 5.5 dB lower with it (.1: 7.3, .3: 4.3); in 42 the human has .24 dB more SI-SDR (.26, .21), and in 20 of those an
+AECMOS of .18 less (.31, .13). Within a human's turn, as BargeIn tells it, nothing is
+lowered: without that 7.9 dB at .1, and a human MOS of 3.4 instead of 3.5 on a real laptop (sound as it is: 3.8)."""
 
 
 class Stream:
@@ -28,7 +47,8 @@ class Stream:
 
     `EgoFilter` says what process, flush, robot_removed and the properties give. With an engine that waits for the end,
     process returns nothing and flush everything. stepping: told the compute time of every hop; what it answers becomes an
-    event. barge_in, learner, on_barge_in, keep_channels, on_suspicion: as of `EgoFilter`.
+    event. barge_in, learner, on_barge_in, keep_channels, on_suspicion, output: as of `EgoFilter`. other: (n,), the sound that
+    was not asked for, of the samples that process or flush returned last.
     """
 
     def __init__(
@@ -41,7 +61,9 @@ class Stream:
         on_barge_in: Callable[[Event], object] | None = None,
         keep_channels: bool = False,
         on_suspicion: Callable[[Event], object] | None = None,
+        output: SoundFor = "recognise",
     ) -> None:
+        self.output = output
         self.engine, self.profile = engine, profile
         self.stepping, self.learner = stepping, learner
         self._barge_in_settings = barge_in
@@ -70,11 +92,12 @@ class Stream:
         self.samples_in = self.samples_out = self._stepped = 0
         self._state = None if self.engine.lookahead is None else self.engine.initial_state()
         self._clip: list[Frame] = []
-        self._synthesiser = Synthesiser(stft)
+        self._synthesiser = Synthesiser(stft, sounds=2)
         self._mic, self._ref = Ring(2 * stft.hop), Ring(2 * stft.hop)
         self._before_start = self.latency - stft.hop
         self._raised: BaseException | None = None
-        self._kept = np.zeros(0, np.float32)
+        self._kept = NOTHING
+        self.other = NOTHING[1]
         self._flushed = False
 
     def process(self, mic: Samples, ref: Samples) -> Samples:
@@ -101,14 +124,15 @@ class Stream:
         self._flushed = True
         padding = np.zeros(self.latency + self.engine.stft.hop, np.float32)
         if not missing:
-            return self._deliver(padding[:0])
+            return self._deliver(NOTHING)
         lead = () if self._microphones is None else (self._microphones,)
         rest = self._run(np.zeros((*lead, padding.size), np.float32), padding)
         if self.engine.lookahead is None:
-            rest = self._finish([self._synthesiser.push(spectrum) for spectrum in self.engine.answer(self._clip)])
+            answer = self.engine.answer(self._clip)
+            rest = self._finish([self._synthesiser.push(spectrum, 1.0, 1.0) for spectrum in answer])
         if talk := self.barge_in.end():
             self._tell_of_speech(talk, "the recording has ended")
-        return self._deliver(rest[:missing])
+        return self._deliver(rest[:, :missing])
 
     def _expect(self, microphones: int | None) -> None:
         """Be ready for that many microphones, None for one; raises SignalError where they, or the profile's, are others."""
@@ -129,14 +153,18 @@ class Stream:
             raise SignalError(f"{found}, expected as many to the end: call reset() before another recording")
 
     def _deliver(self, out: Samples) -> Samples:
-        """The finished samples out (n,), behind those that are kept; where a callback has raised they are all kept."""
+        """Of the finished samples of both sounds (2, n), behind those that are kept, the one that was asked for.
+
+        Where a callback has raised they are all kept.
+        """
         if self._kept.size:
-            out = np.concatenate((self._kept, out))
+            out = np.concatenate((self._kept, out), axis=1)
         error, self._raised = self._raised, None
-        self._kept = out if error else out[:0]
+        self._kept = out if error else out[:, :0]
         if error:
             raise error
-        return out
+        wanted, self.other = out if self.output == "recognise" else out[::-1]
+        return wanted
 
     def _run(self, mic: Samples, ref: Samples) -> Samples:
         hop = self.engine.stft.hop
@@ -152,14 +180,14 @@ class Stream:
         return self._finish(done)
 
     def _finish(self, done: list[Samples]) -> Samples:
-        """What of the synthesised hops belongs to samples that came in, and not to the silence before them."""
+        """What of the synthesised hops (2, hop) belongs to samples that came in, and not to the silence before them."""
         if not done:
-            return np.zeros(0, np.float32)
-        out = done[0] if len(done) == 1 else np.concatenate(done)
-        early = min(self._before_start, out.size)
+            return NOTHING
+        out = done[0] if len(done) == 1 else np.concatenate(done, axis=1)
+        early = min(self._before_start, out.shape[1])
         self._before_start -= early
-        self.samples_out += out.size - early
-        return out[early:]
+        self.samples_out += out.shape[1] - early
+        return out[:, early:]
 
     def _watched_step(self, mic: Samples, ref: Samples) -> Samples:
         """One hop; its compute time is watched, but not the learner's, which is another process in a live run."""
@@ -187,13 +215,15 @@ class Stream:
         engine = self.engine
         if engine.lookahead is None:
             self._collect(frame, engine)
-            return np.zeros(0, np.float32)
+            return NOTHING
         output, self._state = step(engine, frame, self._state)
         if output.speech_probability is not None:
             self._turns.step(output.spectrum, frame.error, self.front.errors)
         self._judge_speech(output.speech_probability, frame.at_any_lag)
         self.front.hear(frame, output, self.speech_probability, self.barge_in.speaking)
-        return self._synthesiser.push(output.spectrum)
+        somebody = 1.0 if self.barge_in.speaking else output.speech_probability
+        listen = 1.0 if somebody is None else NOBODY ** (1.0 - somebody)
+        return self._synthesiser.push(output.spectrum, 1.0, listen)
 
     def _judge_speech(self, probability: float | None, at_any_lag: bool) -> None:
         self.speech_probability = probability

@@ -21,7 +21,7 @@ from edgefilter.integrations.channels import named, taken
 from edgefilter.integrations.duplex import as_pcm16
 from edgefilter.integrations.wire import RATES
 from edgefilter.profile.data import Profile
-from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, Event, Samples
+from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, Event, Samples, SoundFor
 
 Sound = TypeVar("Sound", bytes, bytearray, NDArray[np.int16], NDArray[np.floating])
 _LOGGER = logging.getLogger(__name__)
@@ -36,7 +36,7 @@ class EchoCanceller:
         Of microphone and reference, 8000 to 48000 Hz.
     channels : int
         Of the microphone's sound, 1 to 8. Each is filtered by itself, which takes its own time.
-    profile, engine : optional
+    profile, engine, output : optional
         As of `EgoFilter`.
     mic_channels : sequence of int, optional
         Numbers, from 0, of the channels that are microphones of one array; the answer then is one channel, which
@@ -73,6 +73,7 @@ class EchoCanceller:
         profile: Profile | str | Path | None = None,
         engine: str = "auto",
         mic_channels: Sequence[int] | None = None,
+        output: SoundFor = "recognise",
     ) -> None:
         if sample_rate not in RATES:
             expected = f"{RATES[0]} to {RATES[-1]} Hz: convert the sound before"
@@ -82,7 +83,7 @@ class EchoCanceller:
         array = named(mic_channels, there=channels)
         self.sample_rate, self.channels = sample_rate, channels
         self._heard = [array] if array else [[number] for number in range(channels)]
-        self._filters = [EgoFilter(profile, engine) for _ in self._heard]
+        self._filters = [EgoFilter(profile, engine, output=output) for _ in self._heard]
         first = self._filters[0]
         if first.waits_for_end:
             why = "needs the whole recording before it answers: take another engine"

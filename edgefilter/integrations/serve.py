@@ -31,7 +31,7 @@ from edgefilter.integrations.channels import taken
 from edgefilter.integrations.doors import complain_briefly, in_one_line
 from edgefilter.integrations.duplex import Pace, as_pcm16, from_pcm16
 from edgefilter.integrations.wire import Decode, Form, TwoStreams, message_of
-from edgefilter.types import SAMPLE_RATE, SET_UP_WRONG, Event, Samples
+from edgefilter.types import SAMPLE_RATE, SET_UP_WRONG, Event, Samples, SoundFor
 
 MOST_BYTES = 4_000_000
 """Size of a message: an announced utterance of 40 s at 48 kHz; of sound some 20 ms are usual."""
@@ -188,13 +188,13 @@ class Session:
 class Service:
     """Serves streams until it is told to stop.
 
-    make_filter: makes a stream's filter; told whether it learns. streams: clients at a time; more are sent away with a
-    word. learners: streams that may learn at a time. token: what a client has to send as `Authorization: Bearer TOKEN`.
+    make_filter: makes a stream's filter; told whether it learns, and its output. streams: clients at a time; more are sent
+    away with a word. learners: streams that may learn at a time. token: what a client has to send as `Authorization: Bearer TOKEN`.
     Programs within web pages are sent away: a page that somebody opens must not listen to the robot.
     """
 
     def __init__(
-        self, make_filter: Callable[[bool], EgoFilter], streams: int, learners: int, token: str | None
+        self, make_filter: Callable[[bool, SoundFor], EgoFilter], streams: int, learners: int, token: str | None
     ) -> None:
         self._make, self._streams, self._learners, self._token = make_filter, streams, learners, token
         self._serving = self._learning = 0
@@ -277,7 +277,7 @@ class Service:
             async with (
                 self._making
             ):  # one at a time: several would hold the interpreter's lock and delay the others' sound
-                ego = await asyncio.to_thread(self._make, learns)
+                ego = await asyncio.to_thread(self._make, learns, form.output)
             session = Session(form, ego)
             await self._send(connection, deque([session.ready(learns)]))
             await self._converse(connection, session)

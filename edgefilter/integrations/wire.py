@@ -6,12 +6,12 @@ import json
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
 from edgefilter.errors import SignalError
-from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, Samples
+from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, Samples, SoundFor
 
 HEADER = struct.Struct("<BxHQ")
 """Before the sound of a message of one of two streams: its label, 0 for the microphone and 1 for the reference, an unused
@@ -36,7 +36,8 @@ class Form:
     rate: Hz, of the samples and of the counters. streams: "stereo", microphone and reference interleaved, or "two",
     each message of one stream, with a HEADER. microphones: of an array, interleaved, in "stereo" before the reference.
     codec: "pcm", 16 bit, or "opus", mono, at a rate of 48000 and in two streams. late_ms: how long the microphone waits
-    for a late reference. learn: whether to learn the room. bitrate: bits a second of the answer in Opus.
+    for a late reference. learn: whether to learn the room. bitrate: bits a second of the answer in Opus. output: which
+    of the filter's sounds is the answer.
     """
 
     rate: int = SAMPLE_RATE
@@ -46,6 +47,7 @@ class Form:
     late_ms: int = 0
     learn: bool = False
     bitrate: int = 24000
+    output: SoundFor = "recognise"
 
     @classmethod
     def of(cls, text: str | bytes) -> Form:
@@ -63,6 +65,7 @@ class Form:
             "late_ms": range(2001),
             "learn": (False, True),
             "bitrate": range(6000, 128001),
+            "output": get_args(SoundFor),
         }
         for name, value in given.items():
             allowed = bounds.get(name)

@@ -43,6 +43,11 @@ def test_a_run_says_how_much_of_the_robot_was_removed_at_which_lag_and_how_often
     )
 
 
+def test_a_run_says_which_of_the_two_sounds_it_gives(files, capsys):
+    given = ran(files, "ref", "other", capsys, "--engine", "bypass", "--no-learn", "--sound", "listen")[0]
+    assert given["output"] == "listen"
+
+
 @pytest.mark.slow
 def test_a_reference_of_another_recording_is_said_at_the_end(files, capsys):
     figures, told = ran(files, "mic", "other", capsys, "--engine", "linear", "--no-learn")

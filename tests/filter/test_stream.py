@@ -8,7 +8,7 @@ import pytest
 from edgefilter import EgoFilter, enhance
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.linear import Bypass
-from edgefilter.errors import SignalError
+from edgefilter.errors import SignalError, UsageError
 from edgefilter.filter.stream import Stream
 from edgefilter.types import Output
 from tests import conformance
@@ -129,6 +129,45 @@ class Talkative(Bypass):
         self._hop += 1
         speaks = self._hop * self.hop_s % 34.0 < 32.0
         return Output(output.spectrum, 0.999 if speaks else 0.001), state
+
+
+class Judging(Bypass):
+    """Says that nobody speaks in the first half of a second, then that somebody does, who pauses after 0.3 s."""
+
+    def __init__(self):
+        super().__init__()
+        self.heard = 0
+
+    def step(self, frame, state):
+        self.heard += 1
+        return Output(frame.error, float(31 < self.heard < 50)), state
+
+
+def test_two_sounds_of_the_same_block_differ_where_nobody_speaks():
+    mic = 0.1 * np.random.default_rng(0).standard_normal(16000).astype(np.float32)
+    found = {}
+    for output in ("recognise", "listen"):
+        stream, parts = Stream(Judging(), output=output), []
+        for size in (1000, 700, 0, 14300):
+            at = stream.samples_in
+            out = stream.process(mic[at : at + size], mic[at : at + size])
+            parts.append((out, stream.other))
+        parts.append((stream.flush(), stream.other))
+        assert all(out.shape == other.shape for out, other in parts)
+        found[output] = [np.concatenate(sound) for sound in zip(*parts, strict=True)]
+    recognise, listen = found["recognise"]
+    assert np.array_equal(recognise, enhance(mic, mic, engine="bypass"))
+    assert np.array_equal(listen, found["listen"][0]) and np.array_equal(recognise, found["listen"][1])
+    assert np.allclose(listen[:7000], 0.2 * recognise[:7000], atol=1e-6)
+    assert np.allclose(listen[9000:], recognise[9000:], atol=1e-6)
+
+
+def test_an_engine_that_judges_no_speech_has_one_sound_and_no_third_is_known():
+    ego = EgoFilter(engine="linear", output="listen")
+    out = ego.process(*conformance.conversation(3000))
+    assert out.size and np.array_equal(out, ego.other()) and ego.stats()["output"] == "listen"
+    with pytest.raises(UsageError, match="output 'hear', expected one of recognise, listen"):
+        EgoFilter(engine="linear", output="hear")
 
 
 def test_events_that_nobody_asks_for_hold_the_sound_of_the_latest_ten_minutes():

@@ -111,6 +111,14 @@ def test_each_microphone_is_filtered_by_itself_and_a_stereo_reference_is_its_mea
     assert (left < -15).all()  # of each; 25 dB and more were seen after 0.75 s
 
 
+def test_the_sound_to_listen_to_is_the_lower_one_where_nobody_speaks():
+    noise = np.tile(NOISE[:, 0], 4)
+    loud, soft = (
+        EchoCanceller(engine="crnn", output=output).process(noise, 0 * noise) for output in ("recognise", "listen")
+    )
+    assert np.mean(soft**2) < 0.2 * np.mean(loud**2)
+
+
 def test_events_of_microphones_that_nobody_can_ask_for_do_not_pile_up():
     """Each finished turn holds the human's sound."""
     canceller, ref = EchoCanceller(16000, 3, engine="linear"), 0.1 * np.random.default_rng(1).standard_normal(16000)

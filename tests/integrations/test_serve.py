@@ -23,7 +23,7 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 import edgefilter
-from edgefilter import EgoFilter, SignalError
+from edgefilter import EgoFilter, SignalError, enhance
 from edgefilter.cli import main
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.integrations import serve as module
@@ -56,7 +56,8 @@ def as_float(data):
 @asynccontextmanager
 async def serving(engine="crnn", profile=DEMO / "profile.npz", streams=4, token=None):
     """The address of a service, which is ended afterwards."""
-    async with served(Service(lambda learns: EgoFilter(profile, engine), streams, 0, token)) as address:
+    service = Service(lambda learns, output: EgoFilter(profile, engine, output=output), streams, 0, token)
+    async with served(service) as address:
         yield address
 
 
@@ -140,6 +141,13 @@ def test_a_stereo_stream_is_filtered_as_a_file_is_and_the_human_is_told(conversa
     assert kinds(told)[0] == "ready" and kinds(told)[-1] == "ended" and told[-1]["samples"] == mic.size
     (began,) = (each["time"] for each in told if each["kind"] == "speech_started")
     assert 9.1 < began < 9.6 and told[0]["delay_ms"] == 32.0
+
+
+def test_a_client_gets_the_sound_that_it_asks_for(conversation):
+    mic, ref = (x[: 2 * RATE] for x in conversation[:2])
+    sound, _ = run(heard({"output": "listen"}, stereo_messages(mic, ref)))
+    expected = enhance(as_float(pcm(mic)), as_float(pcm(ref)), DEMO / "profile.npz", "crnn", output="listen")
+    np.testing.assert_allclose(as_float(b"".join(sound)), expected, atol=1 / 32768)
 
 
 @pytest.mark.parametrize("rate", [8000, 44100, 48000])
@@ -278,6 +286,7 @@ def test_a_first_message_needs_to_say_nothing():
         ('{"codec": "mp3"}', "codec 'mp3', expected pcm or opus"),
         ('{"volume": 3}', "'volume', expected rate, streams"),
         ('{"codec": "opus"}', "codec opus needs two streams"),
+        ('{"output": "hear"}', "output 'hear', expected recognise or listen"),
         ('{"late_ms": 5000}', "late_ms 5000, expected 0 to 2000"),
     ],
 )
@@ -552,7 +561,7 @@ def test_a_client_whose_messages_would_fill_the_memory_is_told_and_what_it_sent_
             kept.append(weakref.ref(self))
 
     async def talk():
-        service = Service(lambda learns: Kept(None, "linear"), 1, 0, None)
+        service = Service(lambda learns, output: Kept(None, "linear"), 1, 0, None)
         async with served(service) as address:
             gc.disable()
             try:
@@ -585,7 +594,7 @@ def test_beside_clients_that_send_4_MB_at_once_a_stream_in_real_time_is_filtered
     """Between a message and its answer, of 62 s that others have sent some parts of 20 ms are filtered."""
     filters = []
 
-    def make(learns):
+    def make(learns, output):
         filters.append(Counting(None, "linear"))
         return filters[-1]
 
@@ -621,7 +630,7 @@ def test_a_client_that_is_behind_catches_up_before_others_go_on():
     """A network that stood still for two seconds hands over all at once: that is due, and no backlog."""
     filters = []
 
-    def make(learns):
+    def make(learns, output):
         filters.append(Counting(None, "linear"))
         return filters[-1]
 
