@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from edgefilter.alignment.aligner import COARSE_MARGIN
+from edgefilter.alignment.belief import SAME
 from edgefilter.alignment.delay_line import WAIT, Aligned, Tape
 from edgefilter.alignment.lag_search import CERTAIN, SEEN_ODDS, WINDOW, Found, LagSearch
 from edgefilter.alignment.utterances import FLOOR, NEVER, OnsetDetector
@@ -27,9 +28,8 @@ SEARCH_STRIDE = SAMPLE_RATE // 4
 """Samples of an utterance between two looks for it in what the microphone heard before."""
 IN_VAIN = 6
 """Looks, 1.5 s of speech, after which an utterance that is found nowhere is taken for one that is not heard."""
-AGREE, IN_TIME = 32, SAMPLE_RATE
-"""Samples within which two looks find the same lateness; and of an echo that is followed behind the reference, after which that is
-not late, whatever a look has found."""
+IN_TIME = SAMPLE_RATE
+"""Samples of an echo that is followed behind the reference, after which that is not late, whatever a look has found."""
 DOUBT = SAMPLE_RATE // 2
 """Samples for which speech that begins while the reference is silent waits for it, until it is known to come in time: an
 onset of the robot's is no human's if the reference follows."""
@@ -267,7 +267,7 @@ class ReferenceWatch:
         A look that shares no sound with one that saw the lag before makes it SEEN_ODDS more likely; one that is more likely
         wrong than right does not contradict them.
         """
-        if found.lag >= WAIT and abs(found.lag - self._seen_at) <= AGREE:
+        if found.lag >= WAIT and abs(found.lag - self._seen_at) <= SAME:
             if found.at - self._seen_last >= WINDOW:
                 self._seen_apart, self._seen_last = self._seen_apart + 1, found.at
             self._seen_at = found.lag
