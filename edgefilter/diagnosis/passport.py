@@ -9,15 +9,14 @@ from typing import Any, Literal
 import numpy as np
 from scipy import fft
 
-from edgefilter.alignment.belief import Belief, absent, believe
-from edgefilter.alignment.coarse_lag import CoarseLag
+from edgefilter.alignment.belief import absent, believe
 from edgefilter.calibration.from_recording import fan_in_silences, find_drift, silences
 from edgefilter.calibration.multisine import PERIOD
 from edgefilter.diagnosis.compare import rounded
 from edgefilter.diagnosis.prepare import FRAME, HOP, leads
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.fractional_delay import delayed, interpolate
-from edgefilter.dsp.frames import block_power, blocks, decibels, frames
+from edgefilter.dsp.frames import block_power, decibels, frames
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.dsp.psd import frequencies, hann, third_octave_bands, total_power
 from edgefilter.echo.recording import paired
@@ -89,10 +88,10 @@ class Passport:
     """All that one recording tells; levels in dB of full scale.
 
     lag_ms, lag_spread_ms: median of the seconds whose lag is certain, and the span of their middle eight tenths; sharp:
-    the share of such seconds; without any the lag is coarse, to a hop of 16 ms. drift_ppm: parts of a million by
-    which the reference's clock is faster (the lag shrinks), None where no arrival is sharp. change_db: what is neither
-    linear in the reference nor noise, against what is linear. pauses: whether the robot is silent for long enough to know
-    the noise; if not, it is at most that of the quietest moments. gated, clipped: shares of time and of samples.
+    the share of such seconds. drift_ppm: parts of a million by which the reference's clock is faster (the lag shrinks).
+    change_db: what is neither linear in the reference nor noise, against what is linear. pauses: whether the robot is
+    silent for long enough to know the noise; if not, it is at most that of the quietest moments. gated, clipped: shares
+    of time and of samples.
     """
 
     seconds: float
@@ -106,9 +105,9 @@ class Passport:
     human_db: float
     pauses: bool
     lag_ms: float
-    lag_spread_ms: float | None
+    lag_spread_ms: float
     sharp: float
-    drift_ppm: float | None
+    drift_ppm: float
     removable_db: float
     over_noise_db: float
     change_db: float
@@ -158,13 +157,16 @@ def measure(
     _check(mic, ref)
     known = _levels(mic, ref) | {"human_db": human_db}
     progress("lag and drift")
-    lag, believed = _lag(mic, ref)
-    lags, near, ppm = believed.certain, delayed(ref, lag), None
-    if lags.size:
-        ppm, behind = find_drift(mic, near)
-        near = delayed(ref, lag + behind)
-        if ppm:
-            near = interpolate(near, np.arange(near.size) * (1.0 + 1e-6 * ppm))
+    believed = believe(mic, ref)
+    lag, lags = believed.lag, believed.certain
+    if lag is None:
+        raise absent(ref)
+    if early := leads(lag):
+        raise SignalError(early)
+    ppm, behind = find_drift(mic, delayed(ref, lag))
+    near = delayed(ref, lag + behind)
+    if ppm:
+        near = interpolate(near, np.arange(near.size) * (1.0 + 1e-6 * ppm))
     progress("coherence")
     fan, pauses_s = fan_in_silences(mic, silences(near))
     # echo later than a frame lasts looks like distortion: take the frame length that explains most of the microphone
@@ -178,14 +180,13 @@ def measure(
         told[engine] = Expected(_removed(mic, outputs[engine]), starts, *expected(mic, ref, voice, human_db, engine))
     removable, over_noise, follows = spectra.over(0.0, SAMPLE_RATE / 2)
     removable = max(removable, *(one.removed_db for name, one in told.items() if name == "linear"), 0.0)
-    spread = float(np.quantile(lags, 0.9) - np.quantile(lags, 0.1)) / SAMPLE_RATE * 1000 if lags.size else None
     return Passport(
         **known,
         noise_db=float(decibels(total_power(fan))),
         pauses=pauses_s > 0.0,
         lag_ms=lag / SAMPLE_RATE * 1000,
-        lag_spread_ms=spread,
-        sharp=lags.size / max(believed.lags.size, 1),
+        lag_spread_ms=float(np.quantile(lags, 0.9) - np.quantile(lags, 0.1)) / SAMPLE_RATE * 1000,
+        sharp=lags.size / believed.lags.size,
         drift_ppm=ppm,
         removable_db=removable,
         over_noise_db=over_noise,
@@ -240,25 +241,6 @@ def _levels(mic: Samples, ref: Samples) -> dict[str, Any]:
         told[f"{name}_peak_db"] = float(decibels(float(np.abs(x).max()) ** 2))
     shut, played = (block_power(x, SAMPLE_RATE // 50) for x in (mic, ref))
     return told | {"gated": float(np.mean((shut < GATED) & (played > 0.0)))}
-
-
-def _lag(mic: Samples, ref: Samples) -> tuple[int, Belief]:
-    """Lag in samples, of a path without a sharp arrival the coarse lag, and what is believed look by look.
-
-    Raises SignalError where the reference is not found, or is later than the recording.
-    """
-    found = believe(mic, ref)
-    lag = found.lag
-    if lag is None:
-        coarse = CoarseLag(HOP, 2 * SAMPLE_RATE)
-        for part in zip(blocks(mic, HOP), blocks(ref, HOP)):
-            coarse.step(*part)
-        lag = coarse.find()
-    if lag is None:
-        raise absent(ref)
-    if early := leads(lag):
-        raise SignalError(early)
-    return lag, found
 
 
 class _Spectra:

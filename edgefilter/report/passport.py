@@ -59,11 +59,9 @@ def advice(found: Passport) -> list[str]:
         told += ["let the robot pause for some seconds while it is recorded: the noise is not known, and may be less"]
     if found.mic_peak_db < QUIET_DB:
         told.append(f"turn the microphone's gain up: its peaks reach only {found.mic_peak_db:.0f} dBFS")
-    if found.lag_spread_ms is not None and found.lag_spread_ms > UNSTABLE_MS:
+    if found.lag_spread_ms > UNSTABLE_MS:
         told.append("use larger buffers, or one program for playing and recording: the lag jumps")
-    if found.lag_spread_ms is None:
-        told.append("take the reference as late as possible before the loudspeaker: no arrival is sharp")
-    if abs(found.drift_ppm or 0.0) > DRIFTS_PPM:
+    if abs(found.drift_ppm) > DRIFTS_PPM:
         told.append("use one sound card for loudspeaker and microphone, if you can: the clocks drift apart")
     linear = found.engines.get("linear")
     if linear and found.removable_db - linear.removed_db > UNLEARNED_DB:
@@ -74,14 +72,13 @@ def advice(found: Passport) -> list[str]:
 def rows(found: Passport) -> list[tuple[str, str, str]]:
     """Name, value and what it means, of everything that is one number."""
     noise = f"{found.noise_db:.0f} dBFS" if found.noise_db > -119.0 else "none"
-    spread = "no arrival is sharp" if found.lag_spread_ms is None else f"moves by {found.lag_spread_ms:.1f} ms"
-    drift = "-" if found.drift_ppm is None else f"{found.drift_ppm:+.0f} ppm"
+    moves = f"moves by {found.lag_spread_ms:.1f} ms; certain in {100 * found.sharp:.0f} % of the seconds"
     return [
         ("microphone", f"{found.mic_db:.0f} dBFS", f"peak {found.mic_peak_db:.0f} dBFS"),
         ("reference", f"{found.ref_db:.0f} dBFS", f"peak {found.ref_peak_db:.0f} dBFS"),
         ("noise", noise, "in the robot's pauses" if found.pauses else "at most: in the quietest moments"),
-        ("lag", f"{found.lag_ms:.0f} ms", f"{spread}; sharp in {100 * found.sharp:.0f} % of the seconds"),
-        ("drift", drift, "positive: the lag shrinks"),
+        ("lag", f"{found.lag_ms:.0f} ms", moves),
+        ("drift", f"{found.drift_ppm:+.0f} ppm", "positive: the lag shrinks"),
         ("linear", f"{found.removable_db:.1f} dB", "what a fixed linear filter can take off, by coherence"),
         ("over noise", f"{found.over_noise_db:.1f} dB", "microphone over its noise"),
         ("changed", f"{found.change_db:.0f} dB", "neither linear nor noise, against what is linear"),
