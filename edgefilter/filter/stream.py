@@ -36,9 +36,10 @@ from edgefilter.types import (
 NOTHING: Samples = np.zeros((2, 0), np.float32)
 """No samples of the sound to recognise, and of the one to listen to."""
 NOBODY = 0.2
-"""Gain of the sound to listen to where surely nobody speaks, -14 dB. Eight real robots alone are 7.9 dB lower with it (.1: 10.3,
-.3: 6.3). Humans laid on them 6 to 13 dB below lose .08 dB (.10, .06); they and two as recorded lose an AECMOS of .05 (.11, .01).
-By the calibrated probability robots would be 12.7 dB lower, and these humans .3 dB, on one device 1.9."""
+"""Gain of the sound to listen to where surely nobody speaks, -14 dB. 15 real robots alone, on recordings to tune on, are 36.3 dB
+lower with it than the microphone, and 26.1 in the other sound. Eight humans laid on them 6 to 13 dB below lose .3 dB, one of them
+1.9, and .1 dB of SI-SDR; in seven real double talks AECMOS takes .20 off the human, most where 1.6 is said of the echo. By what
+the network says itself in place of the calibrated probability it would be 31.4 dB, .1 dB and .19."""
 
 
 class Stream:
@@ -220,8 +221,8 @@ class Stream:
             self._turns.step(output.spectrum, frame.error, self.front.errors)
         self._judge_speech(output.speech_probability, frame.at_any_lag)
         self.front.hear(frame, output, self.speech_probability, self.barge_in.speaking)
-        somebody = 1.0 if self.barge_in.speaking else output.speech_probability
-        listen = 1.0 if somebody is None else NOBODY ** (1.0 - somebody)
+        said = output.speech_probability
+        listen = 1.0 if said is None or self.barge_in.speaking else NOBODY ** (1.0 - human_probability(said))
         return self._synthesiser.push(output.spectrum, 1.0, listen)
 
     def _judge_speech(self, probability: float | None, at_any_lag: bool) -> None:
