@@ -122,7 +122,7 @@ def test_without_a_profile_one_is_made_and_proven_against_none(scene: Path, tmp_
     files = ["--recording", str(scene / "mic.wav"), "--reference", str(scene / "ref.wav")]
     assert main(["diagnose", *files, "--apply", str(made), "--json", str(tmp_path / "a.json")]) == 0
     out = capsys.readouterr().out
-    *_, written, following = out.splitlines()
+    *_, written, _, following = out.splitlines()
     assert written == f"written to {made}" and following.startswith("next        edgefilter run ")
     proof = json.loads((tmp_path / "a.json").read_text())["applied"]["proof"]
     assert proof["erle_after_db"] > proof["erle_before_db"] + 3.0
