@@ -95,7 +95,7 @@ DETECTORS = {
 
 
 def probabilities(detector: Detector, x: Samples) -> list[float]:
-    """Of each whole hop of x (n,)."""
+    """Probability of speech after each whole hop of x (n,)."""
     step = detector.start()
     return [step(hop) for hop in x[: x.size // detector.hop * detector.hop].reshape(-1, detector.hop)]
 

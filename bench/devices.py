@@ -193,7 +193,7 @@ def by_device(
 
 
 def against_peers(rows: Sequence[dict], here: Sequence[System], tuned_on: set[str]) -> dict:
-    """On each device `crnn` less the best peer there, paired by human."""
+    """By how much `crnn` is above the best peer of each device, in SI-SDR and words, human by human."""
     laid = [row for row in rows if row["set"] == "laid"]
     peers = [one for one in here if one.kind == "peer"]
     cells, ahead = [], 0

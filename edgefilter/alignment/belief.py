@@ -24,7 +24,7 @@ JUMP = 0.2
 """Probability that from one look to the next the lag is another: utterances last some 5 s, and each may have its own."""
 
 MISSED = 0.3
-"""Probability that a second in which the robot is heard does not show its lag: of 19 real recordings 0.21 of all seconds."""
+"""Probability that a second in which the robot is heard does not show its lag: in 19 real recordings .21 of the seconds did not."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,12 +57,12 @@ class Belief:
 
 
 def believe(recording: Samples, reference: Samples, reach: int = round(MOST_LAG_S * SAMPLE_RATE)) -> Belief:
-    """What is to be believed of the lag of recording (n,) behind reference (m,), between -reach and reach samples.
+    """Estimate the lag of recording (n,) behind reference (m,), between -reach and reach samples, second by second.
 
-    Each look either finds the reference where it is, with the odds of `Found`, or something else, which agrees with another look
-    as often as two of all lags are the same. Between looks a lag stays or changes: a hidden Markov model whose states
-    are the lags that were found (forward-backward algorithm, Rabiner 1989). All of it is weighed against a recording without
-    the reference, in which every look finds chance: a word that two recordings have in common makes them no pair.
+    Each second has the lag of its highest peak: the true one, with the odds of `Found`, or any lag by chance, and two such
+    are the same as seldom as two lags drawn at random. From second to second the true lag stays or changes: a hidden Markov
+    model whose states are the lags that were found (forward-backward algorithm, Rabiner 1989). The other hypothesis is a
+    recording without the reference, all of whose lags are chance; so one word that both happen to hold is not enough.
 
     >>> rng = np.random.default_rng(0)
     >>> said = rng.standard_normal(96_000).astype(np.float32)
@@ -111,7 +111,7 @@ def find_lag(recording: Samples, reference: Samples) -> int:
 
 
 def absent(reference: Samples) -> SignalError:
-    """What to say where a recording does not contain the reference (m,)."""
+    """The error of a recording that does not contain the reference (m,), whose level it tells."""
     level = decibels(np.mean(np.square(reference, dtype=np.float64)))
     return SignalError(
         f"the recording does not contain the reference (of {level:.0f} dBFS) at any lag up to {MOST_LAG_S:g} s: is it of another"

@@ -98,7 +98,7 @@ class Prepared:
 
 
 def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_rate: int = SAMPLE_RATE) -> Prepared:
-    """Resample to 16 kHz, find the constant lag, mark silence and the blocks to fit on.
+    """Resample to 16 kHz, find the constant lag, mark the robot's silence and the blocks that fits may use.
 
     recording (m,), reference (k,): float, full scale +-1, at sample_rate. Raises SignalError for less than a second or
     where the recording does not contain the reference.

@@ -27,7 +27,8 @@ LOUDEST = 1.26
 """Most power of a frame of the answer, over the microphone's: 1 dB. The shipped network stays below; others are turned down."""
 SURE = 100.0
 """Error power over the expected powers of noise and residual echo, 20 dB, from which on a bin is the human's while the robot
-is silent, whatever the network says: it takes parts of a loud human for noise. While the robot speaks this is not so sure."""
+is silent, whatever the network says: it takes parts of a loud human for noise. Not used while the robot speaks, since what is
+left of its echo may be as loud."""
 SHARE_OF_SS = np.float32(0.4)
 """How much of the answer is that of `ss` where the robot is calibrated: it errs elsewhere than the network, and both
 together err less than either; half would be as good, and leave more of a robot alone (models/MODELS.md). Without a
@@ -127,7 +128,7 @@ class Crnn:
         return Output(gain * human, speaks), (following, mask, (mic, reference))
 
     def _run(self, frame: Frame, state: tuple[Samples, ...], mic: np.float32, reference: np.float32) -> Places:
-        """The network on one frame, microphone and reference multiplied by those factors; its answers stand in the places."""
+        """Run the network on a frame whose microphone and reference are scaled by these factors; its answers are in what is returned."""
         if not hasattr(self._own, "places"):  # of the calling thread: several streams may share the engine
             self._own.places = Places(self.model)
         places: Places = self._own.places

@@ -139,5 +139,5 @@ def human_probability(probability: float) -> float:
 
 
 def log_odds(probability: float) -> float:
-    """Of a probability 0 to 1, finite."""
+    """Logarithm of the odds of a probability, 0 to 1; at 0 and 1 those of 1e-9 and of 1 - 1e-9."""
     return math.log(max(probability, 1e-9) / max(1.0 - probability, 1e-9))

@@ -148,7 +148,7 @@ class EgoFilter:
 
     @property
     def engine_name(self) -> str:
-        """The engine at work; while another one takes over, that one."""
+        """The engine at work; during a crossfade the one that takes over."""
         return self._engine.name
 
     @property
@@ -258,7 +258,8 @@ class EgoFilter:
         -----
         For robots without a loopback: while the reference blocks are zeros, the utterance is looked for in the
         microphone for 30 s, and from about 0.1 s after its first sound on it is the reference. A reference channel that
-        carries sound is believed instead, and drops what was announced. paper-ss counts announcements.
+        carries sound is believed instead, and drops what was announced. The engine paper-ss counts announcements and
+        needs none.
         """
         aligner = self._stream.front.aligner
         if aligner and not aligner.announce(as_samples(utterance, "utterance")):
@@ -273,8 +274,8 @@ class EgoFilter:
         Returns
         -------
         list of Event
-            Oldest first, at most the latest 1000; see `Event` for the kinds. Turns have sound of ten minutes in all: where
-            nobody asked for longer, earlier ones are left out of their events.
+            Oldest first, at most the latest 1000; see `Event` for the kinds. Ten minutes of turns' sound are kept
+            until somebody asks; what is older has lost its sound.
         """
         happened = list(self._stream.events)
         self._stream.events.clear()

@@ -139,7 +139,7 @@ class EchoCanceller:
         return self._filters[0].events()
 
     def process(self, mic: Sound, ref: Sound) -> Sound:
-        """Take the next samples of both and return as many of the human.
+        """Take the next samples of microphone and reference, and return as many of the human.
 
         Parameters
         ----------
