@@ -11,14 +11,13 @@ import numpy as np
 from edgefilter.alignment.coarse_lag import CoarseLag
 from edgefilter.alignment.delay_line import HALF_WIDTH, WAIT, Aligned, Tape, kernel_table, read_delayed, read_line
 from edgefilter.alignment.delay_tracker import DRIFTED, FAINT, SIZE, STRIDE, DelayMeasurement, DelayMeter, DriftFilter
-from edgefilter.alignment.lag_search import CERTAIN, MINIMUM, REFLECTIONS, SEEN_ODDS, Found, LagSearch
+from edgefilter.alignment.lag_search import CERTAIN, MINIMUM, MOST_LAG_S, REFLECTIONS, SEEN_ODDS, Found, LagSearch
 from edgefilter.alignment.utterances import AHEAD, Announcements, FirstSounds, OnsetDetector, Playback, Utterance
 from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, AlignmentCounts, AlignmentState, AlignmentStats, Samples
 
-MOST_LAG_S, LIKELY_LAG_S = 3.0, 2.0
-"""Lag of the playback up to which it is found: of speech that comes in a burst and is played later, over a network; and up to
-which an utterance is waited for: one that is heard later is rarer than a loudspeaker that is muted."""
+LIKELY_LAG_S = 2.0
+"""Lag of the playback up to which an utterance is waited for: one that is heard later is rarer than a loudspeaker that is muted."""
 LATE = SAMPLE_RATE // 10
 """Samples by which a reference may come after its echo and is still found, to be told of."""
 SEARCH_STRIDE = 768

@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import expit
 
-from edgefilter.alignment.aligner import MOST_LAG_S
 from edgefilter.alignment.delay_line import Tape
-from edgefilter.alignment.lag_search import CERTAIN, Found, LagSearch
+from edgefilter.alignment.lag_search import CERTAIN, MOST_LAG_S, Found, LagSearch
 from edgefilter.dsp.frames import decibels
 from edgefilter.errors import SignalError
 from edgefilter.types import SAMPLE_RATE, Array, Samples

@@ -14,6 +14,8 @@ from edgefilter.dsp.frames import rise
 from edgefilter.dsp.lag import LOWEST_HZ, flattened
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 
+MOST_LAG_S = 3.0
+"""Lag of the playback up to which it is found: of speech that comes in a burst and is played later, over a network."""
 WINDOW = 7168
 """Samples of the microphone that one search looks at, 0.45 s."""
 MINIMUM = 832

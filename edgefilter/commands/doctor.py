@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from edgefilter.alignment.aligner import MOST_LAG_S
+from edgefilter.alignment.lag_search import MOST_LAG_S
 from edgefilter.audio import pulse, virtual
 from edgefilter.audio.device import find, input_port, monitor_of
 from edgefilter.audio.live import LiveSource
