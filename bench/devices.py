@@ -22,7 +22,7 @@ import numpy as np
 
 from bench import recordings, results, runner, systems
 from bench.evaluate import names, numbers, of, slim
-from bench.metrics import IN_TIME_S, difference, mean, per_hour
+from bench.metrics import IN_TIME_S, delays_s, difference, later, mean, per_hour
 from bench.recordings import Cells, Clip, Recording
 from bench.systems import System
 
@@ -136,10 +136,9 @@ def who_interrupts(name: str, title: str, rows: Sequence[dict], able: Sequence[S
         if not told:
             continue
         count, hours = sum(row["false_starts"] for row in told), sum(row["duration"] for row in told) / 3600
-        delays = [np.inf if row["delay_s"] is None else 1000 * row["delay_s"] for row in heard if not row["early"]]
-        soon = [sum(delay <= 1000 * limit for delay in delays) for limit in (IN_TIME_S, SOON_S)]
-        median = float(np.quantile(delays, 0.5, method="higher")) if delays else None
-        cells.append([one.title, count, per_hour(count, hours), *soon, median if median != np.inf else "never",
+        delays = delays_s(heard)
+        within = [sum(delay <= limit for delay in delays) for limit in (IN_TIME_S, SOON_S)]
+        cells.append([one.title, count, per_hour(count, hours), *within, milliseconds(later(delays, 0.5)),
                       sum(np.isinf(delays)), len(heard) - len(delays)])  # fmt: skip
     minutes = (
         sum({row["clip"]: row["duration"] for row in rows if row["set"] == "alone" and "duration" in row}.values()) / 60
@@ -157,6 +156,11 @@ def who_interrupts(name: str, title: str, rows: Sequence[dict], able: Sequence[S
     ]
     text = f"{minutes:.1f} minutes of the robot alone, {humans} humans. A detector hears what stands behind its name, as late as that comes."
     return results.table(f"interrupts-{name}", f"What interrupts the robot. {title}", columns, cells, text)
+
+
+def milliseconds(delay_s: float | None) -> float | str | None:
+    """A delay for a cell: in milliseconds, "never" where it is infinite."""
+    return "never" if delay_s == np.inf else delay_s and 1000 * delay_s
 
 
 def starts(alone: Sequence[dict]) -> str | None:
@@ -222,11 +226,10 @@ def barge_in(rows: Sequence[dict], here: Sequence[System], tuned_on: set[str]) -
             if starts(alone) is None:
                 continue
             told = [row for row in laid if "early" in row]
-            delays = [np.inf if row["delay_s"] is None else 1000 * row["delay_s"] for row in told]
-            median = float(np.quantile(delays, 0.5, method="higher")) if delays else np.inf
             early = sum(row["early"] for row in told)
+            median = later(delays_s(told) + early * [np.inf], 0.5)
             cells.append([marked(device, tuned_on), one.title, starts(alone), soon(laid),
-                          median if np.isfinite(median) else "never", early])  # fmt: skip
+                          milliseconds(np.inf if median is None else median), early])  # fmt: skip
     columns = ["device", "system", "false starts", f"noticed in {SOON_S} s", ("median, ms", 0), "already on"]
     return results.table("barge-in", "Barge-in", columns, cells)
 

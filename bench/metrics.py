@@ -191,6 +191,16 @@ def in_time(found: Mapping) -> bool:
     return found["delay_s"] is not None and found["delay_s"] <= IN_TIME_S
 
 
+def delays_s(found: Iterable[Mapping]) -> list[float]:
+    """Delays of what `noticed` found where speech was not on already, infinite for who was never noticed."""
+    return [math.inf if one["delay_s"] is None else one["delay_s"] for one in found if not one["early"]]
+
+
+def later(delays: Sequence[float], share: float) -> float | None:
+    """The delay that this share of them does not exceed: one of them, the later where it lies between two; None without any."""
+    return float(np.quantile(delays, share, method="higher")) if delays else None
+
+
 def starts(events: Sequence[Event]) -> int:
     return sum(event.kind == "speech_started" for event in events)
 

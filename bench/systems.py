@@ -371,8 +371,10 @@ def _behind(base: System, name: str, held: bool) -> System:
     def missing() -> object:
         return base.missing(), detector.start()
 
+    def code() -> str:
+        return base.code() + _files(detectors) + str(versions([detector.package]))
+
     title = f"{detector.title}{f' held {detectors.HELD_S:g} s' if held else ''} behind {base.title}"
-    code = lambda: base.code() + _files(detectors) + str(versions([detector.package]))  # noqa: E731
     return System(f"{base.name}+{name}{'-held' * held}", title, "detector", run, base.knows, None, missing, code)
 
 

@@ -28,7 +28,20 @@ import numpy as np
 
 from bench import results
 from bench.cache import Cache
-from bench.metrics import IN_TIME_S, THRESHOLDS, counted, first_sound, in_time, mean, noticed, per_hour, replay, starts
+from bench.metrics import (
+    IN_TIME_S,
+    THRESHOLDS,
+    counted,
+    delays_s,
+    first_sound,
+    in_time,
+    later,
+    mean,
+    noticed,
+    per_hour,
+    replay,
+    starts,
+)
 from bench.recogniser import Recogniser, normalise, word_errors
 from bench.recordings import CALIBRATION, find_recordings, progress
 from bench.simulate.conversations import Scene, make_scene, read_clips, read_voices
@@ -309,8 +322,8 @@ def tables(rows: Sequence[Mapping], alone: Sequence[Mapping], points: Mapping[st
 
 def noticing(found: Sequence[Mapping]) -> list:
     """n, share in time, delays, how many early (speech was on already), how many never noticed."""
-    delays = [math.inf if one["delay_s"] is None else one["delay_s"] for one in found if not one["early"]]
-    p50, p90 = (float(np.quantile(delays, q, method="higher")) if delays else None for q in (0.5, 0.9))
+    delays = delays_s(found)
+    p50, p90 = (later(delays, share) for share in (0.5, 0.9))
     share = counted(one["in_time"] for one in found)
     return [len(found), share, p50, p90, len(found) - len(delays), sum(map(math.isinf, delays))]
 

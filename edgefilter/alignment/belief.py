@@ -21,7 +21,6 @@ SAME = 32
 """Samples by which the lags of two looks may differ and be one lag: what clocks and a person who walks move it by."""
 JUMP = 0.2
 """Probability that from one look to the next the lag is another: utterances last some 5 s, and each may have its own."""
-
 MISSED = 0.3
 """Probability that a second in which the robot is heard does not show its lag: in 19 real recordings .21 of the seconds did not."""
 

@@ -219,10 +219,11 @@ class Stream:
         output, self._state = step(engine, frame, self._state)
         if output.speech_probability is not None:
             self._turns.step(output.spectrum, frame.error, self.front.errors)
-        self._judge_speech(output.speech_probability, frame.at_any_lag)
-        self.front.hear(frame, output, self.speech_probability, self.barge_in.speaking)
         said = output.speech_probability
-        listen = 1.0 if said is None or self.barge_in.speaking else NOBODY ** (1.0 - human_probability(said))
+        human = None if said is None else human_probability(said)
+        self._judge_speech(human, frame.at_any_lag)
+        self.front.hear(frame, output, self.speech_probability, self.barge_in.speaking)
+        listen = 1.0 if human is None or self.barge_in.speaking else NOBODY ** (1.0 - human)
         return self._synthesiser.push(output.spectrum, 1.0, listen)
 
     def _judge_speech(self, probability: float | None, at_any_lag: bool) -> None:
@@ -231,7 +232,7 @@ class Stream:
         if probability is not None:
             suspect = at_any_lag or (self._watch is not None and self._watch.suspect)
             wait = self._watch.wait // self.engine.stft.hop if self._watch else 0
-            self.speech_probability = 0.0 if suspect else human_probability(probability)
+            self.speech_probability = 0.0 if suspect else probability
         if talk := self.barge_in.note(self.speech_probability, wait):
             self._tell_of_speech(talk, f"probability {self.speech_probability or 0.0:.2f}")
             if call := self._called.get(talk):
