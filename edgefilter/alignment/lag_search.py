@@ -57,6 +57,12 @@ class Found:
     at: int = 0
     heard: int = 0
 
+    @classmethod
+    def followed(cls, lag: int, probability: float, at: int) -> Found:
+        """A lag that is known with that probability without a look."""
+        odds = probability / (1.0 - probability) / cls(lag, 1.0).prior
+        return cls(lag, EVEN * odds ** (1.0 / STEEP), at)
+
     @property
     def old(self) -> bool:
         """Whether the utterance would have sounded for so long that the window before must show it too."""

@@ -213,11 +213,10 @@ def _check_learned(target: Samples, predicted: Samples, fit: Samples, delay: flo
     held = drop[block_power(fit, BLOCK) == 0.0]
     if held.size and float(np.quantile(held, 0.8)) >= CLEARLY_DB:
         return
-    swapped = "are recording and reference swapped, or " if delay < 0.0 else ""
     clocks = f", clocks {abs(ppm):.0f} ppm apart" if ppm else ""
     raise SignalError(
         f"the robot is in the recording (lag {1000 * delay / SAMPLE_RATE:.0f} ms{clocks}) but too faint beside what"
-        f" else is heard to learn its path from: {swapped}does a human talk nearly all the time? give a recording in which"
+        f" else is heard to learn its path from: does a human talk nearly all the time? give a recording in which"
         " the robot talks alone, or a calibration (--profile)"
     )
 

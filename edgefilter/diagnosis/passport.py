@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy import fft
 
-from edgefilter.alignment.belief import absent, believe
+from edgefilter.alignment.belief import believe, find_lag
 from edgefilter.calibration.from_recording import fan_in_silences, find_drift, silences
 from edgefilter.calibration.multisine import PERIOD
 from edgefilter.diagnosis.compare import rounded
@@ -88,10 +88,10 @@ class Passport:
     """All that one recording tells; levels in dB of full scale.
 
     lag_ms, lag_spread_ms: median of the seconds whose lag is certain, and the span of their middle eight tenths; sharp:
-    the share of such seconds. drift_ppm: parts of a million by which the reference's clock is faster (the lag shrinks).
-    change_db: what is neither linear in the reference nor noise, against what is linear. pauses: whether the robot is
-    silent for long enough to know the noise; if not, it is at most that of the quietest moments. gated, clipped: shares
-    of time and of samples.
+    the share of such seconds. lost_ms: what is missing in the reference. drift_ppm: parts of a million by which the
+    reference's clock is faster (the lag shrinks). change_db: what is neither linear in the reference nor noise, against
+    what is linear. pauses: whether the robot is silent for long enough to know the noise; if not, it is at most that of
+    the quietest moments. gated, clipped: shares of time and of samples.
     """
 
     seconds: float
@@ -107,6 +107,7 @@ class Passport:
     lag_ms: float
     lag_spread_ms: float
     sharp: float
+    lost_ms: float
     drift_ppm: float
     removable_db: float
     over_noise_db: float
@@ -158,9 +159,7 @@ def measure(
     known = _levels(mic, ref) | {"human_db": human_db}
     progress("lag and drift")
     believed = believe(mic, ref)
-    lag, lags = believed.lag, believed.certain
-    if lag is None:
-        raise absent(ref)
+    lag, lags = find_lag(mic, ref, believed), believed.certain
     if early := leads(lag):
         raise SignalError(early)
     ppm, behind = find_drift(mic, delayed(ref, lag))
@@ -187,6 +186,7 @@ def measure(
         lag_ms=lag / SAMPLE_RATE * 1000,
         lag_spread_ms=float(np.quantile(lags, 0.9) - np.quantile(lags, 0.1)) / SAMPLE_RATE * 1000,
         sharp=lags.size / believed.lags.size,
+        lost_ms=believed.lost / SAMPLE_RATE * 1000,
         drift_ppm=ppm,
         removable_db=removable,
         over_noise_db=over_noise,

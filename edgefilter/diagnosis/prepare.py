@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
-from edgefilter.alignment.belief import Belief, absent, believe
+from edgefilter.alignment.belief import LEADS, Belief, believe, find_lag
 from edgefilter.calibration.from_recording import TAIL_S
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.fractional_delay import delayed
@@ -42,8 +42,6 @@ ORDINARY = 2.0
 CUT, CUT_DB = 32, -30.0
 """A reference begins or ends in the middle of a word where so many samples (2 ms) at its end are no further below its
 loudest 20 ms: pauses are softer."""
-LEADS_MS = 5.0
-"""By which a recording may have the robot's voice before the reference has it: recorders that are started by hand differ."""
 PAUSE_S, LAG_STEP = 0.5, 480
 """Silence of the reference after which a player may have started anew, and samples (30 ms) by which the lag must differ
 then: less is left for the effects to explain."""
@@ -116,9 +114,9 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     white_y = whiten(y, known)
     white = whiten(predicted, known)
     believed = believe(white_y, white)
-    if believed.lag is None:
-        raise absent(x)
-    offset = starting_offset(white, white_y, believed.lag)
+    later = round(profile.delay)  # of the recording behind the reference than behind what is predicted
+    lag = find_lag(y, x, replace(believed, lags=believed.lags + later)) - later
+    offset = starting_offset(white, white_y, lag)
     if model.timed:  # a clock that drifts has drifted further, or less, by the time that the offset takes
         offset += starting_offset(whiten(model.predict(delayed(x, start + offset)), known), white_y, 0)
     pieces = utterance_lags(x, white, white_y, believed, offset)
@@ -144,8 +142,7 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
         warnings += (
             f"the reference is cut in mid-word: only {begin / SAMPLE_RATE:.1f} to {end / SAMPLE_RATE:.1f} s are evaluated",
         )
-    if early := leads(profile.delay + offset):
-        warnings += (early,)
+    warnings += tuple(filter(None, (leads(profile.delay + offset), believed.missing)))
     if len(pieces) > 1:
         lags = ", ".join(f"{lag:.1f} from {first / SAMPLE_RATE:.1f} s" for first, _, lag in pieces)
         warnings += (f"the utterances lag by different numbers of samples: {lags}; aligned one by one",)
@@ -156,10 +153,12 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
 
 def leads(lag: float) -> str:
     """What to ask where the recording lags by so many samples, below zero, behind the reference; nothing where it may."""
-    if (lead_ms := -1000.0 * lag / SAMPLE_RATE) <= LEADS_MS:
+    if lag >= -LEADS:
         return ""
-    asked = "are the two swapped, or did the recording of the reference begin later?"
-    return f"the recording has the robot {lead_ms:.0f} ms before the reference: {asked}"
+    ms = -1000.0 * lag / SAMPLE_RATE
+    return (
+        f"the recording has the robot {ms:.0f} ms before the reference: did the recording of the reference begin later?"
+    )
 
 
 def ordinary_distortion(profile: Profile, predicted: Samples) -> tuple[tuple[Samples, Array], ...]:

@@ -1,8 +1,6 @@
-"""What the reference does not share with the playback: another speed (44.1 kHz taken for 48 kHz), samples that are missing."""
+"""A playback at another speed than the reference's: 44.1 kHz taken for 48 kHz."""
 
 from __future__ import annotations
-
-from collections import deque
 
 import numpy as np
 
@@ -18,9 +16,6 @@ LENGTH, REACH, FADE = round(2.5 * SAMPLE_RATE), SAMPLE_RATE, 1024
 STANDS_OUT, AHEAD = 15.0, 1.5
 """Height of the correlation's peak over the rms of all lags, and over the peak at the right speed, from which on a speed is
 believed. Robots of other voices in 668 pairs reach 12.4 by chance; those played at the wrong speed have 15 to 72."""
-GROWN, TIMES, WITHIN = 48, 4, 10 * SAMPLE_RATE
-"""Samples, 3 ms, by which the lag must grow at once to count, how often it must, and within how many samples: lost buffers have 5
-to 100 ms each; a queue that runs dry between two utterances has one such step an utterance."""
 
 
 def other_speed(mic: Samples, ref: Samples) -> float | None:
@@ -47,35 +42,3 @@ def _faded(x: Samples) -> Samples:
     """The signal (n,) with soft ends: two hard cuts would correlate with one another."""
     edge = rise(FADE)
     return x * np.concatenate((edge, np.ones(x.size - 2 * FADE), edge[::-1]))
-
-
-class GrowingLag:
-    """Notices a lag that grows again and again: each time the reference has lost samples that the loudspeaker has played.
-
-    >>> lag = GrowingLag()
-    >>> [lag.step(16_000 * k, 800 + 128 * k) or lag.grown(16_000 * k) for k in range(6)]
-    [0, 0, 0, 0, 512, 640]
-    """
-
-    def __init__(self) -> None:
-        self._delay: float | None = None
-        self._steps: deque[tuple[int, float]] = deque()
-
-    def step(self, now: int, delay: float) -> None:
-        """Take a delay in samples that was found at position now."""
-        grown = 0.0 if self._delay is None else delay - self._delay
-        self._delay = delay
-        if grown < -GROWN:
-            self._steps.clear()
-        elif grown > GROWN:
-            self._steps.append((now, grown))
-
-    def grown(self, now: int) -> int:
-        """Samples by which it has grown of late; 0 unless it did so TIMES within WITHIN."""
-        return 0 if self.holds(now) or len(self._steps) < TIMES else round(sum(by for _, by in self._steps))
-
-    def holds(self, now: int) -> bool:
-        """Whether the lag has not grown in the last 10 s."""
-        while self._steps and self._steps[0][0] < now - WITHIN:
-            self._steps.popleft()
-        return not self._steps

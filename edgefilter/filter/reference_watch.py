@@ -4,32 +4,30 @@ from __future__ import annotations
 
 import math
 import sys
+from collections import deque
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
-from edgefilter.alignment.aligner import COARSE_MARGIN
-from edgefilter.alignment.belief import SAME
-from edgefilter.alignment.delay_line import WAIT, Aligned, Tape
-from edgefilter.alignment.lag_search import CERTAIN, SEEN_ODDS, WINDOW, Found, LagSearch
-from edgefilter.alignment.utterances import FLOOR, NEVER, OnsetDetector
+from edgefilter.alignment.aligner import LIKELY_LAG_S
+from edgefilter.alignment.belief import believed
+from edgefilter.alignment.delay_line import Aligned, Tape
+from edgefilter.alignment.lag_search import CERTAIN, EVEN, Found, LagSearch
+from edgefilter.alignment.utterances import FLOOR, OnsetDetector
 from edgefilter.dsp import fourier
 from edgefilter.dsp.lag import one_signal
 from edgefilter.filter.microphones import SILENT
-from edgefilter.filter.playback_faults import LENGTH, SPEEDS, GrowingLag, other_speed
+from edgefilter.filter.playback_faults import LENGTH, SPEEDS, other_speed
 from edgefilter.filter.removal import Removal
 from edgefilter.filter.robot_sound import LOUD, RobotSound
 from edgefilter.filter.volume import pre_emphasised
-from edgefilter.types import PRE_ROLL, SAMPLE_RATE, EventKind, Frame, Samples
+from edgefilter.types import SAMPLE_RATE, EventKind, Frame, Samples
 
 LATEST = SAMPLE_RATE
-"""Samples by which a reference may be late and is still recognised as such."""
-SEARCH_STRIDE = SAMPLE_RATE // 4
-"""Samples of an utterance between two looks for it in what the microphone heard before."""
-IN_VAIN = 6
-"""Looks, 1.5 s of speech, after which an utterance that is found nowhere is taken for one that is not heard."""
-IN_TIME = SAMPLE_RATE
-"""Samples of an echo that is followed behind the reference, after which that is not late, whatever a look has found."""
+"""Samples by which a reference may be late and is still recognised as such. A look hears twice as many at most, so that half is left then."""
+LOOKS = 12
+"""Looks that are remembered: one after DOUBT of each utterance, then one every LATEST, and one at each realignment."""
 DOUBT = SAMPLE_RATE // 2
 """Samples for which speech that begins while the reference is silent waits for it, until it is known to come in time: an
 onset of the robot's is no human's if the reference follows."""
@@ -52,12 +50,11 @@ Verdict = Literal["unknown", "fits", "late"]
 class ReferenceWatch:
     """Looks at both channels beside the aligner, hop by hop, and says once what is wrong with the reference.
 
-    The aligner finds echoes that come after the reference. Here each utterance that it has not found is looked for in
-    what the microphone heard before, in the same way with the channels exchanged. A robot often says what resembles an
-    earlier utterance, whose echo the microphone may still hear: so what is found there must not be found as well, at the
-    same lag, in the reference that the aligner has delayed. hop: samples a step. bins: of a spectrum. verdict: "unknown"
-    until an utterance was found by either, or by neither for long; "fits" and "late" then. without: whether the robot is
-    heard while the reference is silent. same: whether microphone and reference are one signal.
+    Where the reference is, and whether it comes after its echo, is believed as of a whole recording (`believed`), from the
+    latest looks: what the aligner follows is one, and where it follows nothing, or the reference was late, both channels are
+    searched, at lags either way: a sentence that resembles an earlier one, whose echo still sounds, is found at both its lags,
+    and so at none. hop: samples a step. bins: of a spectrum. verdict: "late" or "fits" once either is certain. without:
+    whether the robot is heard while the reference is silent. same: whether microphone and reference are one signal.
 
     >>> watch = ReferenceWatch(256, 257)
     >>> watch.verdict, watch.wait
@@ -66,17 +63,16 @@ class ReferenceWatch:
 
     def __init__(self, hop: int, bins: int) -> None:
         self._hop = hop
-        self._search = LagSearch(LATEST)
-        self._mic, self._ref, self._earlier = (Tape(self._search.span + LENGTH) for _ in range(3))
+        self._search = LagSearch(round(LIKELY_LAG_S * SAMPLE_RATE), early=LATEST, window=2 * LATEST)
+        self._mic, self._ref = (Tape(self._search.span + LENGTH) for _ in range(2))
         self._onsets = OnsetDetector(hop)
         self.verdict: Verdict = "unknown"
         self.without = self.same = False
-        self._late = self._stage = self._looks = self._in_time = 0
-        self._seen_at, self._seen_apart, self._seen_last = NEVER, 0, NEVER
-        self._growing, self._lacks = GrowingLag(), False
+        self._looks: deque[Found] = deque(maxlen=LOOKS)
+        self._late = self._stage = self._next = self._looked = 0
+        self._missing, self._grew = "", False
         self._speed: float | None = None
         self._off_speed, self._to_compare, self._compared = False, 0, 0
-        self._to_search = SEARCH_STRIDE
         self._idle = True
         self._power = {"unfound": [0.0, 0], "idle": [0.0, 0]}
         self._sound = RobotSound(hop, bins)
@@ -94,7 +90,7 @@ class ReferenceWatch:
     @property
     def _displaced(self) -> bool:
         """Whether a fault of the reference is known: it is late, lacks samples or has another speed."""
-        return self.verdict == "late" or self._lacks or self._off_speed
+        return self.verdict == "late" or bool(self._missing) or self._off_speed
 
     @property
     def wait(self) -> int:
@@ -103,7 +99,7 @@ class ReferenceWatch:
             return 0
         if not self._idle:  # what has begun is told once it is found that the reference fits, never if it is late
             return sys.maxsize
-        return max(DOUBT, self._late + SEARCH_STRIDE)
+        return max(DOUBT, self._late)
 
     def step(
         self, mic: Samples, ref: Samples, aligned: Aligned, frame: Frame, removal: Removal, speaking: bool
@@ -111,24 +107,23 @@ class ReferenceWatch:
         """Take a hop (hop,) of both channels and what was made of it; what is to be said. speaking: whether a human is."""
         self._mic.push(mic)
         self._ref.push(ref)
-        self._earlier.push(aligned.reference)
         if self._onsets.step(ref):
-            self._stage, self._to_search, self._looks = 0, SEARCH_STRIDE, 0
+            self._next = self._ref.end + DOUBT
         self._idle = aligned.state in ("idle", "announced")  # what was announced is no reference before it is heard
-        said = self._look(aligned)
         power, played = float(mic.dot(mic)) / self._hop, float(ref.dot(ref)) / self._hop
         checks: tuple[tuple[EventKind, str], ...] = (
+            ("reference_late", self._look(aligned)),
             ("robot_unfound", self._weigh(power, aligned)),
             ("echo_unpredicted", self._unpredicted(removal)),
             ("same_signal", self._same(pre_emphasised(mic), pre_emphasised(ref))),
-            ("reference_gaps", self._lacks_samples(aligned)),
+            ("reference_gaps", self._lacks_samples()),
             ("rate_mismatch", self._compare_speed(aligned)),
             (
                 "reference_missing",
                 self._wait_for_any(power, played) or self._listen_without(played, aligned, frame, speaking),
             ),
         )
-        return said + [(kind, detail) for kind, detail in checks if detail]
+        return [(kind, detail) for kind, detail in checks if detail]
 
     def _once(self, what: str) -> bool:
         """Whether this is the first time."""
@@ -138,8 +133,7 @@ class ReferenceWatch:
 
     def _unpredicted(self, removal: Removal) -> str:
         """Say that hardly anything of the robot can be subtracted."""
-        holds = self._growing.holds(self._ref.end)  # of a lag that has just changed nothing is learned yet
-        if not removal.unpredicted or self._displaced or not holds or not self._once("unpredicted"):
+        if not removal.unpredicted or self._displaced or self._grew or not self._once("unpredicted"):
             return ""
         return (
             f"the linear stage removes only {removal.removed_db:.1f} dB of the robot: the microphone seems to be processed, the"
@@ -147,17 +141,12 @@ class ReferenceWatch:
             " echo cancellation of the device, and turn the volume down"
         )
 
-    def _lacks_samples(self, aligned: Aligned) -> str:
+    def _lacks_samples(self) -> str:
         """Say that the lag grows again and again."""
-        if aligned.realigned:
-            self._growing.step(self._ref.end, aligned.delay)
-        grown = self._growing.grown(self._ref.end)
-        self._lacks = grown > 0
-        if not self._lacks or not self._once("gaps"):
+        if not self._missing or not self._once("gaps"):
             return ""
         return (
-            f"samples are missing in the reference: its echo comes later and later, by {1000 * grown / SAMPLE_RATE:.0f} ms in"
-            " the last 10 s; little of the robot is removed, and nobody is noticed while it talks; use a loopback that loses"
+            f"{self._missing}; little of the robot is removed, and nobody is noticed while it talks; use a loopback that loses"
             " nothing, or larger buffers"
         )
 
@@ -228,79 +217,43 @@ class ReferenceWatch:
             " device?"
         )
 
-    def _look(self, aligned: Aligned) -> list[tuple[EventKind, str]]:
-        """One step of a search, where one is due, and what it leads to."""
-        if aligned.state == "locked" and aligned.delay < -WAIT:
-            self._stage = 0  # a search that rests would compare what lies further apart than it looks
-            return self._found_late(round(-aligned.delay))
-        if aligned.state in ("locked", "coarse") and self.verdict != "fits":
-            self._in_time += self._hop
-            if self.verdict == "unknown" or self._in_time >= IN_TIME:
-                self.verdict = "fits"
-        if not self._onsets.active:
-            return []
-        self._to_search -= self._hop
-        stage, self._stage = self._stage, 0
-        if stage == 2:
-            return self._decide(aligned)
-        if stage == 1:
+    def _look(self, aligned: Aligned) -> str:
+        """Take a look, in three hops, or the lag that the aligner follows for one; say once that the reference is late."""
+        now, stage, self._stage = self._ref.end, self._stage, 0
+        found = None
+        if aligned.state in ("locked", "coarse") and self.verdict != "late":
+            if aligned.realigned or now >= self._next:
+                sure = CERTAIN / (CERTAIN + 1.0) if aligned.state == "coarse" else aligned.confidence
+                found, self._next = Found.followed(round(aligned.delay), sure, now), now + LATEST
+        elif stage == 1:
             self._stage = 2
-            self._listen()
-        elif self._to_search <= 0 and not (aligned.state in ("locked", "coarse", "lost") and self.verdict == "fits"):
-            self._to_search, self._stage = SEARCH_STRIDE, 1
-            self._prepare(self._mic)
-        return []
-
-    def _decide(self, aligned: Aligned) -> list[tuple[EventKind, str]]:
-        found = self._search.find()
-        if found and self._agrees(found) and not self._resembles_earlier(found.lag):
-            self._looks = 0
-            return self._found_late(found.lag)
-        self._looks += 1
-        if self._looks >= IN_VAIN and (self.verdict == "unknown" or aligned.state == "locked"):
+            self._search.listen({0: self._mic}, now, self._looked)
+        elif stage == 2:
+            found = self._search.find()
+            self._looked = now + min(
+                found.lag if found else 0, 0
+            )  # at that lag the next look hears what this one did not
+        elif self._onsets.active and now >= self._next:
+            self._next, self._stage = now + LATEST, 1
+            self._search.prepare(self._ref, now, now - self._search.span)
+        if found is None:
+            return ""
+        # where a robot says something again, so does chance: what is more likely wrong than right is not believed if it agrees
+        self._looks.append(found if found.clearness > EVEN else replace(found, clearness=0.0))
+        belief = believed(self._looks)
+        self._missing, self._grew, late = belief.missing, bool((belief.steps[-1:] > 0).any()), belief.late[-1]
+        if late > CERTAIN / (CERTAIN + 1.0):
+            self.verdict = "late"
+        elif late < 1.0 / (CERTAIN + 1.0):
             self.verdict = "fits"
-        return []
-
-    def _agrees(self, found: Found) -> bool:
-        """Whether the lateness that a look found is certain by what it and those before it saw at the same lag.
-
-        A look that shares no sound with one that saw the lag before makes it SEEN_ODDS more likely; one that is more likely
-        wrong than right does not contradict them.
-        """
-        if found.lag >= WAIT and abs(found.lag - self._seen_at) <= SAME:
-            if found.at - self._seen_last >= WINDOW:
-                self._seen_apart, self._seen_last = self._seen_apart + 1, found.at
-            self._seen_at = found.lag
-            return found.odds * SEEN_ODDS**self._seen_apart > CERTAIN
-        if found.odds > 1.0:
-            self._seen_at, self._seen_apart, self._seen_last = found.lag, 0, found.at
-        return False
-
-    def _found_late(self, samples: int) -> list[tuple[EventKind, str]]:
-        """The reference is late by so many samples; what is to be said."""
-        self.verdict, self._late, self._in_time = "late", samples, 0
-        told = (
-            f"the reference comes {1000 * samples / SAMPLE_RATE:.0f} ms after the microphone has heard it: the robot is"
+        self._late = -int(belief.lags[-1]) if self.verdict == "late" else 0
+        if not self._late or not self._once("late"):
+            return ""
+        return (
+            f"the reference comes {1000 * self._late / SAMPLE_RATE:.0f} ms after the microphone has heard it: the robot is"
             " not removed, and nobody is noticed while it talks; hand the reference over earlier, or the microphone later;"
             " or are the two swapped?"
         )
-        return [("reference_late", told)] if self._once("late") else []
-
-    def _resembles_earlier(self, lag: int) -> bool:
-        """Whether the utterance resembles what the aligner says is heard of an earlier one, about that many samples before."""
-        self._prepare(self._earlier)
-        self._listen()
-        found = self._search.find()  # the aligned reference comes somewhat before its echo
-        return found is not None and abs(found.lag - lag) <= COARSE_MARGIN + PRE_ROLL
-
-    def _prepare(self, tape: Tape) -> None:
-        """Begin a search for the present utterance in that tape, from LATEST before its beginning on."""
-        self._search.prepare(tape, self._ref.end, self._onsets.current.start - LATEST)
-
-    def _listen(self) -> None:
-        """Give the search the utterance's latest WINDOW of the reference."""
-        now = self._ref.end
-        self._search.listen({0: self._ref}, now, max(self._onsets.current.start, now - WINDOW))
 
     def _weigh(self, power: float, aligned: Aligned) -> str:
         """Compare the microphone's power while the reference plays but is not found with that while the reference is silent."""

@@ -59,7 +59,11 @@ def advice(found: Passport) -> list[str]:
         told += ["let the robot pause for some seconds while it is recorded: the noise is not known, and may be less"]
     if found.mic_peak_db < QUIET_DB:
         told.append(f"turn the microphone's gain up: its peaks reach only {found.mic_peak_db:.0f} dBFS")
-    if found.lag_spread_ms > UNSTABLE_MS:
+    if found.lost_ms:
+        told.append(
+            f"use a loopback that loses nothing, or larger buffers: {found.lost_ms:.0f} ms are missing in the reference"
+        )
+    elif found.lag_spread_ms > UNSTABLE_MS:
         told.append("use larger buffers, or one program for playing and recording: the lag jumps")
     if abs(found.drift_ppm) > DRIFTS_PPM:
         told.append("use one sound card for loudspeaker and microphone, if you can: the clocks drift apart")

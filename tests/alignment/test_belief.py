@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edgefilter.alignment.belief import believe, find_lag
+from edgefilter.alignment.belief import believe, believed, find_lag
+from edgefilter.alignment.lag_search import Found
 from edgefilter.dsp.fractional_delay import interpolate
 from edgefilter.errors import SignalError
 from tests.diagnosis.robot_scene import DELAY, record, voice
@@ -30,8 +31,11 @@ def test_any_lag_either_way_is_found_beside_a_talker_as_loud(said, heard, lag):
     assert find_lag(shifted, np.pad(said, (48_000, 48_000))) == pytest.approx(DELAY + lag, abs=2)
 
 
-def test_swapped_files_are_found_at_the_lag_the_other_way_round(said, heard):
-    assert find_lag(said, heard) == pytest.approx(-DELAY, abs=2)
+@pytest.mark.parametrize("lag", [-3000, 0, round(DELAY) - 16])
+def test_swapped_files_are_known_by_the_reverberation_before_its_sound(said, heard, lag):
+    later = np.roll(np.pad(said, (0, RATE)), lag)
+    with pytest.raises(SignalError, match="seem to be swapped"):
+        find_lag(later, np.pad(heard, (0, RATE)))
 
 
 def test_of_other_sounds_nothing_is_certain_and_it_is_said_which_error_is_likely(said):
@@ -74,3 +78,22 @@ def test_one_word_in_common_makes_two_recordings_no_pair():
     other[word] += 0.3 * record(said)[word]
     assert believe(other[word], said[word]).certain.size == 1
     assert believe(other, said).lag is None
+
+
+def looks(*lags, clearness=1.4):
+    """What looks that found these lags say together."""
+    return believed([Found(lag, clearness, RATE * second) for second, lag in enumerate(lags, 1)])
+
+
+def test_weak_looks_that_agree_are_certain_and_ten_milliseconds_are_waited_for():
+    assert looks(-2088).late[-1] < 0.5 < 0.99 < looks(-2088, 5000, -2098, -2111).late[-1]
+    assert 0.5 < looks(-2088, 5000, -2098, -7111).late[-1] < 0.99
+    assert looks(-60, -60, clearness=2.4).late[-1] < 0.01
+
+
+def test_a_lag_that_grows_again_and_again_is_lost_samples_and_one_that_moves_otherwise_is_not():
+    assert looks(*range(800, 1440, 160), clearness=2.4).lost == 480
+    assert looks(*range(1440, 800, -160), clearness=2.4).lost == 0
+    assert looks(*range(800, 1000, 5), clearness=2.4).lost == 0  # clocks
+    for lags in np.random.default_rng(0).integers(800, 22_000, (20, 12)).tolist():  # each utterance has its own
+        assert looks(*lags, clearness=2.4).lost == 0

@@ -81,14 +81,13 @@ def test_one_file_given_twice_is_refused_with_the_likely_cause(files, command, c
     assert "same signal" in line and "loudspeaker" in line
 
 
-@pytest.mark.parametrize("command", ["compare", "diagnose"])
-def test_an_unrelated_reference_is_refused(files, command, capsys):
-    names = ["--recording", str(files / "mic.wav"), "--reference", str(files / "other.wav")]
-    assert main([command, "--profile", str(DEMO / "profile.npz"), *names]) == 1
-    assert "does not contain the reference" in capsys.readouterr().err
-
-
-def test_swapped_files_are_asked_about(files, capsys):
-    names = ["--recording", str(files / "ref.wav"), "--reference", str(files / "mic.wav")]
-    assert main(["compare", "--profile", str(DEMO / "profile.npz"), *names]) == 0
-    assert "are the two swapped" in capsys.readouterr().out
+@pytest.mark.parametrize("command", ["compare", "diagnose", "passport"])
+@pytest.mark.parametrize(
+    ("recording", "reference", "cause"),
+    [("mic", "other", "does not contain the reference"), ("ref", "mic", "seem to be swapped")],
+)
+def test_an_unrelated_reference_and_swapped_files_are_refused(files, command, recording, reference, cause, capsys):
+    names = ["--recording", str(files / f"{recording}.wav"), "--reference", str(files / f"{reference}.wav")]
+    for profile in ([], ["--profile", str(DEMO / "profile.npz")])[: 1 + (command != "passport")]:
+        assert main([command, *profile, *names]) == 1
+        assert cause in capsys.readouterr().err

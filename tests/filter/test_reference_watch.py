@@ -1,5 +1,6 @@
 """A reference that is late, missing, or another sound: it is said, and no robot is taken for somebody because of it."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,6 @@ from scipy import signal
 import edgefilter
 from edgefilter import EgoFilter
 from edgefilter.alignment.delay_line import Aligned
-from edgefilter.alignment.lag_search import Found
 from edgefilter.filter.barge_in import BargeIn
 from edgefilter.filter.reference_watch import ReferenceWatch
 from edgefilter.filter.removal import Removal
@@ -81,28 +81,6 @@ def test_the_microphone_waits_for_a_reference_that_comes_some_milliseconds_late(
     before, left = (float(np.mean(np.square(x[3 * RATE :]))) for x in (mic, out))
     assert 10 * np.log10(before / left) > 24.0  # 27 dB where the reference is 4 ms early; without waiting 20 and 2
     assert not {event.kind for event in ego.events()} & set(SET_UP_WRONG)
-
-
-def test_a_lateness_that_looks_at_different_sounds_agree_on_is_certain_though_each_is_weak():
-    watch, weak, strong = ReferenceWatch(256, 257), 1.4, 2.4
-    looks = [(2088, weak, 0), (2098, weak, 4096), (2111, weak, 8192), (5000, 1.0, 12288), (2105, weak, 16384)]
-    assert [watch._agrees(Found(*look)) for look in looks] == [False, False, False, False, True]
-    assert not watch._agrees(Found(7000, weak, 20480)) and not watch._agrees(Found(2105, weak, 24576))
-    assert not watch._agrees(Found(900, strong, 28672)) and watch._agrees(Found(910, strong, 32768))
-    assert not any(watch._agrees(Found(60, strong, 36864 + at)) for at in (0, 8192)), "the microphone waits"
-
-
-def test_a_search_that_rests_while_the_reference_is_late_is_given_up(robot):
-    watch, resting = ReferenceWatch(256, 257), 0
-    for at in range(0, 3 * RATE, 256):
-        mic, ref = (x[at : at + 256] for x in robot)
-        resting = resting or (at if watch._stage == 1 else 0)
-        late = resting and at < resting + RATE
-        aligned = Aligned(
-            np.zeros(256, np.float32), -300.0 if late else np.nan, 0.0, 0.0, "locked" if late else "begun", False
-        )
-        watch.step(mic, ref, aligned, Frame(*(np.zeros(257, np.float32),) * 6), Removal(256), False)
-    assert watch.verdict == "late"
 
 
 @pytest.mark.slow
@@ -195,7 +173,7 @@ def watched(*parts, removal=None):
     """What is said, and when, s, of a silent reference; parts: (seconds, rms of the microphone, state of the aligner)."""
     watch, silence, now, said = ReferenceWatch(1600, 1601), np.zeros(1600, np.float32), 0.0, []
     for seconds, rms, state in parts:
-        aligned = Aligned(silence, float("nan"), 0.0, 0.0, state, False)
+        aligned = Aligned(silence, 0.0 if state == "locked" else float("nan"), 0.0, 0.0, state, False)
         for _ in range(round(10 * seconds)):
             now += 0.1
             heard = np.full(1600, rms, np.float32)
@@ -319,7 +297,7 @@ def test_a_reference_that_loses_samples_is_named_and_one_whose_lag_changes_with_
         kept[at : at + 160] = False
     cut = np.concatenate((ref[kept], np.zeros(ref.size - int(kept.sum()), np.float32)))
     said = [event for event in events(EgoFilter(engine="linear"), mic, cut) if event.kind in SET_UP_WRONG]
-    assert [event.kind for event in said] == ["reference_gaps"] and " ms in the last 10 s" in said[0].detail
+    assert [event.kind for event in said] == ["reference_gaps"] and re.search(r"by \d+ ms in \d s;", said[0].detail)
     assert not [event for event in events(EgoFilter(engine="linear"), mic, ref) if event.kind == "reference_gaps"]
 
 
