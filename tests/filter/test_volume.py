@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import soundfile
 
+from edgefilter import EgoFilter
+from edgefilter.filter.budget import DEMO
 from edgefilter.filter.volume import EchoLimiter, Volume
 
 HOP = 256
@@ -192,3 +195,23 @@ def test_another_path_is_noticed_though_now_and_then_a_hop_fits() -> None:
     mic = np.where(np.arange(len(echo))[:, None] % 4 == 3, echo, 0.1 * hops(2.0, 1))
     _, changed = limited(mic, echo)
     assert any(changed[:70])
+
+
+def test_a_voice_that_is_lowered_for_a_moment_is_no_turned_volume_where_the_reference_carries_it() -> None:
+    """By 12 dB for 0.4 s, again and again, as an agent may do at a suspicion; and, last, a reference that does not tell."""
+    ref, rng = soundfile.read(DEMO / "reference.flac", dtype="float32")[0][: 6 * 16000], np.random.default_rng(0)
+    since = np.arange(ref.size) % 24000
+    gain = np.where((since < 6400) & (np.arange(ref.size) > 3 * 16000), 10 ** (-12 / 20), 1.0)
+    lowered = ref * np.convolve(np.pad(gain, (80, 79), mode="edge"), np.full(160, 1 / 160), "valid")
+    room = 0.1 * rng.standard_normal(1600) * np.exp(-np.arange(1600) / 250)
+    room[0] = 0.3
+    full = (np.arange(ref.size) > 3 * 16000) & (since > 8000)
+    volume_db, removed_db = [], []
+    for played, told in ((ref, ref), (lowered, lowered), (lowered, ref)):
+        mic = np.convolve(np.pad(played, (800, 0)), room)[: ref.size] + 3e-5 * rng.standard_normal(ref.size)
+        ego = EgoFilter(engine="linear")
+        out = np.concatenate((ego.process(mic, told), ego.flush()))
+        volume_db.append(ego.stats()["linear_stage"]["gain_db"])
+        removed_db.append(10 * np.log10(np.mean(mic[full] ** 2) / np.mean(out[full] ** 2)))
+    assert volume_db[1] == pytest.approx(volume_db[0], abs=0.1)
+    assert removed_db[1] > removed_db[0] - 4.0 and removed_db[1] > 30.0 > 15.0 > removed_db[2]
