@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import binary_closing, uniform_filter1d
 
-from edgefilter.alignment.belief import find_lag
+from edgefilter.alignment.belief import believe, find_lag
 from edgefilter.calibration.sweep import DRIFT_REACH
 from edgefilter.dsp.fractional_delay import delayed, interpolate
 from edgefilter.dsp.frames import SILENT, all_block_power, block_power, decibels, frames
@@ -76,7 +76,8 @@ def self_calibrate(recording: Samples, reference: Samples) -> Profile:
     300.0
     """
     y, x = paired(recording, reference)
-    lag = find_lag(y, x)
+    believed = believe(y, x)
+    lag = find_lag(y, x, believed)
     ppm, behind = find_drift(y, delayed(x, lag))
     lag += behind
     psd, seconds = fan_in_silences(y, silences(delayed(x, lag)))
@@ -89,7 +90,7 @@ def self_calibrate(recording: Samples, reference: Samples) -> Profile:
     sound = whiten(_drifting(delayed(x, delay - PRE_ROLL), ppm), psd)
     path = fit_path(sound, target, weights, float(np.square(rough).max()))
     predicted = convolve_from(sound, path, 0)
-    _check_learned(target, predicted, fit, delay, ppm)
+    _check_learned(target, predicted, fit, delay, ppm, believed.missing)
     bands, snr = bands_over_fan(predicted)
     echo = EchoModel(path.astype(np.float32))
     for effect in EFFECTS:  # those that come with the package: whoever loads the profile knows no others
@@ -207,7 +208,7 @@ def bands_over_fan(predicted: Samples) -> tuple[np.ndarray, np.ndarray]:
     return bands, 10 * np.log10(np.clip(np.array(means, np.float64), 1e-2, 1e12))
 
 
-def _check_learned(target: Samples, predicted: Samples, fit: Samples, delay: float, ppm: float) -> None:
+def _check_learned(target: Samples, predicted: Samples, fit: Samples, delay: float, ppm: float, missing: str) -> None:
     """Raise SignalError unless the prediction takes CLEARLY_DB away in a fifth of the blocks that no fit has used."""
     drop = decibels(block_power(target, BLOCK)) - decibels(block_power(target - predicted, BLOCK))
     held = drop[block_power(fit, BLOCK) == 0.0]
@@ -216,8 +217,8 @@ def _check_learned(target: Samples, predicted: Samples, fit: Samples, delay: flo
     clocks = f", clocks {abs(ppm):.0f} ppm apart" if ppm else ""
     raise SignalError(
         f"the robot is in the recording (lag {1000 * delay / SAMPLE_RATE:.0f} ms{clocks}) but too faint beside what"
-        f" else is heard to learn its path from: does a human talk nearly all the time? give a recording in which"
-        " the robot talks alone, or a calibration (--profile)"
+        f" else is heard to learn its path from: {missing or 'does a human talk nearly all the time?'}; give a recording"
+        " in which the robot talks alone, or a calibration (--profile)"
     )
 
 

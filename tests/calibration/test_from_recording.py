@@ -68,6 +68,13 @@ def test_without_a_robot_it_is_one_line(said):
         self_calibrate(0.1 * record(said) + voice(10.0, seed=5), said)
 
 
+def test_a_reference_that_loses_samples_is_the_likely_cause_where_no_path_is_learned(said):
+    kept = np.arange(said.size) % RATE < RATE - 800
+    cut = np.pad(said[kept], (0, said.size - int(kept.sum())))
+    with pytest.raises(SignalError, match=r"samples are missing in the reference: .* by \d+ ms in 9 s"):
+        self_calibrate(record(said), cut)
+
+
 def test_a_filter_of_the_users_own_is_not_in_a_profile_that_others_may_load(said):
     class Own(Effect):
         name, stage, family = "my_filter", "path", "linear path"
