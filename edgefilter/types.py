@@ -62,10 +62,14 @@ class Frame(NamedTuple):
 
 
 class Output(NamedTuple):
-    """An engine's answer: the human's spectrum (bins,) complex64 and, if it judges that, whether a human speaks (0-1)."""
+    """An engine's answer: the human's spectrum (bins,) complex64 and, if it judges that, whether a human speaks (0-1).
+
+    unexplained: power of the judged answer in bins where the error stands out of noise and residual echo, and in all bins.
+    """
 
     spectrum: Spectrum
     speech_probability: float | None = None
+    unexplained: tuple[float, float] = (1.0, 1.0)
 
 
 _Speech: TypeAlias = Literal["speech_suspected", "speech_dismissed", "speech_started", "speech_stopped"]

@@ -80,8 +80,10 @@ class Ladder:
         if weight == 1.0:
             return other, LadderState(coming)
         spectrum = output.spectrum + np.float32(weight) * (other.spectrum - output.spectrum)
-        probability = output.speech_probability if weight < 0.5 else other.speech_probability
-        return Output(spectrum, probability), LadderState(heard, coming, max(state.filling - 1, 0), weight)
+        louder = output if weight < 0.5 else other
+        return Output(spectrum, louder.speech_probability, louder.unexplained), LadderState(
+            heard, coming, max(state.filling - 1, 0), weight
+        )
 
     def _move(self, weight: float, *rungs: int) -> float:
         """The next weight of the voice that is coming in (rungs: heard, coming), towards whichever of the two is nearer to what is wanted."""
@@ -140,7 +142,7 @@ class Judged:
     def step(self, frame: Frame, state: EngineState) -> tuple[Output, EngineState]:
         output, own = self._engine.step(frame, state[0])
         judged, other = self._judge.step(frame, state[1])
-        return Output(output.spectrum, judged.speech_probability), (own, other)
+        return Output(output.spectrum, judged.speech_probability, judged.unexplained), (own, other)
 
 
 def with_network_as_judge(engine: Engine | ClipEngine, profile: Profile | None = None) -> Engine | ClipEngine:

@@ -223,11 +223,13 @@ class FrontEnd:
         return spectra[0], np.stack((x, x - error, error))
 
     def hear(self, frame: Frame, output: Output, probability: float | None, speaking: bool) -> None:
-        """Tell the spatial filter of an array what the engine made of the latest frame, and whether a human speaks.
+        """Tell residual echo and spatial filter what the engine made of the latest frame, and whether a human speaks.
 
         probability: None from an engine that does not judge it; the share of what exceeds fan and residual echo then
         stands for it, and for the mask. Frames that may hold the robot at any lag teach nothing: its echo is not subtracted.
         """
+        if self.linear_stage:
+            self.linear_stage.residual.nobody_speaks = probability is not None and not speaking
         if self.spatial is None or self.errors is None or frame.at_any_lag:
             return
         power = fourier.power(frame.error)

@@ -13,7 +13,14 @@ from edgefilter.dsp.stft import Synthesiser
 from edgefilter.engines.base import ClipEngine, Engine, EngineState
 from edgefilter.engines.spectral_subtraction import FLOOR
 from edgefilter.errors import SignalError
-from edgefilter.filter.barge_in import INTERRUPTIONS, SUSPICIONS, BargeIn, BargeInSettings, human_probability
+from edgefilter.filter.barge_in import (
+    INTERRUPTIONS,
+    SUSPICIONS,
+    UNEXPLAINED_MEMORY,
+    BargeIn,
+    BargeInSettings,
+    human_probability,
+)
 from edgefilter.filter.echo_path import Learner
 from edgefilter.filter.front_end import FrontEnd
 from edgefilter.filter.reference_watch import ReferenceWatch
@@ -98,6 +105,7 @@ class Stream:
         self._raised: BaseException | None = None
         self._kept = NOTHING
         self.other = NOTHING[1]
+        self._unexplained = np.ones(2)
         self._flushed = False
 
     def process(self, mic: Samples, ref: Samples) -> Samples:
@@ -219,8 +227,10 @@ class Stream:
         output, self._state = step(engine, frame, self._state)
         if output.speech_probability is not None:
             self._turns.step(output.spectrum, frame.error, self.front.errors)
-        said = output.speech_probability
-        human = None if said is None else human_probability(said)
+        said, speaking = output.speech_probability, self.barge_in.speaking
+        self._unexplained = UNEXPLAINED_MEMORY * self._unexplained + np.array(output.unexplained)
+        share = 1.0 if speaking else float(self._unexplained[0] / self._unexplained[1])  # who speaks may do so softly
+        human = None if said is None else human_probability(said, share)
         self._judge_speech(human, frame.at_any_lag)
         self.front.hear(frame, output, self.speech_probability, self.barge_in.speaking)
         listen = 1.0 if human is None or self.barge_in.speaking else NOBODY ** (1.0 - human)

@@ -120,20 +120,24 @@ def test_an_engine_without_a_network_gives_no_probability_and_no_events():
     assert not [event for event in ego.events() if event.kind.startswith("speech")]
 
 
-def test_the_network_can_judge_beside_an_engine_that_does_not_and_changes_nothing_of_its_sound():
+def test_the_network_can_judge_beside_the_linear_stage_and_changes_nothing_of_its_sound():
     mic, ref = (
         soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0][:SAMPLE_RATE] for name in ("mic", "reference")
     )
     network = BargeInSettings(judge="network")
     found = {}
-    for name, engine, settings in (("ss", "ss", None), ("judged", "ss", network), ("crnn", "crnn", network)):
+    for name, engine, settings in (
+        ("linear", "linear", None),
+        ("judged", "linear", network),
+        ("crnn", "crnn", network),
+    ):
         ego = EgoFilter(DEMO / "profile.npz", engine=engine, barge_in=settings)
         out = [ego.process(mic[at : at + 256], ref[at : at + 256]) for at in range(0, mic.size, 256)]
         found[name] = np.concatenate(out), ego.speech_probability, ego
-    assert np.array_equal(found["judged"][0], found["ss"][0])
-    assert found["judged"][1] == found["crnn"][1] and found["ss"][1] is None
+    assert np.array_equal(found["judged"][0], found["linear"][0])
+    assert found["judged"][1] == found["crnn"][1] and found["linear"][1] is None
     stats = found["judged"][2].stats()
-    assert stats["engine"] == "ss" and stats["model"] == found["crnn"][2].stats()["model"]
+    assert stats["engine"] == "linear" and stats["model"] == found["crnn"][2].stats()["model"]
 
 
 def test_a_budget_that_changes_no_engine_beside_the_network_as_judge_is_no_secret():

@@ -180,3 +180,23 @@ def test_what_no_waveform_predicts_is_expected_as_the_windowed_frame_holds_it() 
     energy = squares[:, -window.size :] @ window
     tilt = np.linspace(0.0, 2.0, STFT.bins)
     np.testing.assert_allclose(found, energy[0] + energy[1] * tilt, rtol=1e-3)  # a grid of 601
+
+
+def test_what_sounds_with_the_voice_in_other_bins_is_expected_while_nobody_speaks() -> None:
+    """A motor 20 dB below the echo, in bins of its own: nothing is learned of it until it is known that nobody speaks."""
+    echo, motor, fan = np.zeros((3, STFT.bins), np.float32)
+    echo[20:60], motor[150:154], fan[:] = 1.0, 0.1, 1e-6
+    residual = Residual(STFT)
+
+    def expected(frames: int) -> float:
+        for _ in range(frames):
+            _, left = residual.step(spectrum(echo), spectrum(motor + fan), NOTHING, fan=fan)
+        return float(left[151])
+
+    unknown = expected(200)
+    residual.nobody_speaks = True
+    half_a_second, later = expected(31), expected(500)
+    assert unknown < half_a_second < 0.02 and later == pytest.approx(0.2, rel=0.02)  # twice as much
+    residual.nobody_speaks = False
+    motor[151] = 10.0
+    assert expected(200) == pytest.approx(later, rel=0.02)
