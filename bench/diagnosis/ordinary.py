@@ -25,7 +25,6 @@ from bench.stale import DIAGNOSIS
 from edgefilter.calibration.calibrate import calibrate
 from edgefilter.diagnosis.ordinary import LEAST_DB, Chance, Ordinary, explained_db, p_value
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.score import Scorer
 from edgefilter.echo.effect import vanishes
 from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.errors import UsageError
@@ -43,7 +42,7 @@ def gains(case: Path) -> dict[str, float]:
     """Trial.gain_db of each effect that a search tries, fitted alone; 0 where its fit finds nothing."""
     recorded = signals(case)
     prepared = prepare(calibrate(*map(recorded.get, CALIBRATION)), recorded["mic"], recorded["ref"])
-    scorer, model = Scorer(prepared), prepared.model
+    scorer, model = prepared, prepared.model
     base, found = scorer.of(model), {name: 0.0 for name in names() if not find(name).free}
     for name in found:
         effect = find(name)

@@ -63,7 +63,7 @@ class Row:
 def examine(name: str, profile: Profile | None, y: Samples, x: Samples) -> Row:
     """The row of recording y (n,) of the robot saying x (n,); profile None: one is made from the recording."""
     try:
-        cut = HeldOut(profile or self_calibrate(y, x), y, x).cut
+        cut = HeldOut(profile, y, x).cut
         start = profile or self_calibrate(y[:cut], x[:cut])
         found = diagnose(start, y[:cut], x[:cut])
         named = tuple(finding.effect for finding in in_order(found.ranking))

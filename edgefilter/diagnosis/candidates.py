@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from edgefilter.diagnosis.prepare import HOP
+from edgefilter.diagnosis.criteria import Criteria
+from edgefilter.diagnosis.ordinary import percent
+from edgefilter.diagnosis.recording import HOP, STEP, bands
 from edgefilter.diagnosis.result import Candidate, Fate
-from edgefilter.diagnosis.score import STEP, Scorer
 from edgefilter.diagnosis.trials import Found, Tried
 from edgefilter.echo.effect import neutral
 from edgefilter.echo.effects.catalogue import find
@@ -23,8 +24,7 @@ def candidates(found: Found, named: Collection[str]) -> tuple[Candidate, ...]:
     less 2 N times the fall of the level, N the samples held out: the penalty comes on top of that. An effect that was
     tried beside others only is ranked by its gain there.
     """
-    scorer = Scorer(found.prepared)
-    held = float(scorer.starts.size * STEP) * scorer.freedom.sum() / (HOP - 1)
+    held = float(found.recording.starts.size * STEP) * bands().freedom.sum() / (HOP - 1)
     tried = {entry.name: entry for entry in found.tried}
     seen = {step.name: Tried(step.name, None if place else step, step) for place, step in enumerate(found.steps)}
     rows = [_row(entry, found, named, held) for entry in {**seen, **tried}.values()]
@@ -75,8 +75,8 @@ def _fate(entry: Tried, found: Found, named: Collection[str]) -> tuple[Fate, str
         return "not fitted", "what is left is too little for it to be named"
     if entry.alone is None and entry.beside is None:
         return "below its bar", "its fit finds nothing"
-    if entry.short:
-        return "below its bar", entry.short
+    if entry.alone and entry.alone.p_value > Criteria.false_rate:
+        return "below its bar", f"{percent(entry.alone.p_value)} of ordinary recordings show as much of some effect"
     if not named:
         return "explains too little", "for it to be what happened"
     beside = entry.beside

@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from edgefilter.diagnosis.independence import Independence, independence
-from edgefilter.diagnosis.prepare import Prepared, prepare
-from edgefilter.diagnosis.score import Scorer
+from edgefilter.diagnosis.prepare import prepare
+from edgefilter.diagnosis.recording import Recording, Score
 from edgefilter.dsp.frames import block_power, blocks, decibels, frames
 from edgefilter.dsp.psd import frequencies, periodograms, total_power
 from edgefilter.echo.effects.catalogue import chain
-from edgefilter.echo.evidence import Score
 from edgefilter.echo.measurement import whiten
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.recording import BLOCK
@@ -37,7 +36,7 @@ class Comparison:
 
     Decibels of excess are of the residual, whitened by the fan's PSD, over the fan.
 
-    excess_db: of the samples that no diagnosis fits on, every second half second, as Scorer scores them: the one figure
+    excess_db: of the samples that no diagnosis fits on, every second half second, as Recording scores them: the one figure
     that compare, add, diagnose and the report show; 0 means that nothing is unexplained. All else is of the whole.
     noise_floor_db: the fan, dB re full scale. bands: (low_hz, high_hz, excess_db). times: (start_s, end_s, excess_db).
     levels: (low_dbfs, high_dbfs, excess_db) by the level of the predicted voice. lags: (low_ms, high_ms, share) of the
@@ -125,12 +124,12 @@ def compare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     return describe(prepared, prepared.model)
 
 
-def describe(prepared: Prepared, model: EchoModel, score: Score | None = None) -> Comparison:
+def describe(prepared: Recording, model: EchoModel, score: Score | None = None) -> Comparison:
     """The comparison of a prepared recording with what a model predicts; score: of that model, where it is known.
 
     A gain of the microphone is taken out of the residual before that is held against the fan, which passed it as well.
     """
-    score, prepared = score or Scorer(prepared).of(model), prepared.behind(model)
+    score, prepared = score or prepared.of(model), prepared.behind(model)
     measurement, prediction = prepared.measurement, score.prediction
     residual = measurement.recording - prediction
     psd = prepared.noise_psd
@@ -165,7 +164,7 @@ def describe(prepared: Prepared, model: EchoModel, score: Score | None = None) -
     )
 
 
-def independence_of(prepared: Prepared, model: EchoModel, score: Score) -> Independence | None:
+def independence_of(prepared: Recording, model: EchoModel, score: Score) -> Independence | None:
     """Whether what a model leaves is noise, see `independence`; score: of that model."""
     prepared = prepared.behind(model)
     measurement, use, active = prepared.measurement, prepared.usable, prepared.active

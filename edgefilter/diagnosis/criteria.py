@@ -21,8 +21,7 @@ class Criteria:
     # Shares of what there is to explain. 78 recordings of one or two hidden effects (52 and 26; voices of training and
     # validation) are named as well by these four as by fifteen numbers for a question each
     nearly: float = 0.85
-    """A simpler effect that explains this share of what a flexible one does is preferred, and so is an earlier start: a
-    flexible model takes up some of whatever is left."""
+    """A simpler effect that explains this share of what a flexible one does is preferred: that takes up some of whatever is left."""
     half: float = 0.5
     """What all findings together explain at least of the excess, in level and in power: less is not what happened."""
     part: float = 0.2
@@ -37,12 +36,9 @@ class Criteria:
     to says little."""
     most_effects: int = 3
     """A bound on the work: what the search is checked on holds two at once, and a third to be taken back."""
-    starts: int = 2
-    """Further effects to begin with where the best one has not led to an explanation: of two at once the louder may
-    hide the other."""
     little_db: float = 2.0
-    """Over the silences, and with next to nothing of the power over the fan, no other start is tried: the model of the right
-    effect leaves as much, and another start costs seconds. Nor is a last resort tried then."""
+    """Over the silences, and with next to nothing of the power over the fan, no last resort is tried: the model of the right
+    effect leaves as much."""
 
     # Refit: all effects beside each other
     rounds: int = 3
@@ -61,9 +57,8 @@ class Criteria:
     heard_db: float = 0.6
     """Where it is no more than this above them, there is nothing beside the effects that were found, whose models err a
     little."""
-    most_cost: int = 100
-    """Sum of the costs of all fits, ten seconds, after which no further one is made. Where that happens the diagnosis
-    says so."""
+    most_fits: int = 80
+    """A bound on the work: after four times the whole catalogue no further fit is made. Where that happens the diagnosis says so."""
 
     # The verdict
     explained_db: float = 0.8

@@ -17,10 +17,10 @@ from edgefilter.diagnosis.joint import fit_jointly
 from edgefilter.diagnosis.laws import law_of, with_laws
 from edgefilter.diagnosis.leftover import left_in_words, leftover
 from edgefilter.diagnosis.precision import precision
-from edgefilter.diagnosis.prepare import Prepared, prepare
+from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.proof import listed, with_fitted
+from edgefilter.diagnosis.recording import Recording, share_of
 from edgefilter.diagnosis.result import Diagnosis, Finding, Interval, Verdict, in_order
-from edgefilter.diagnosis.score import Scorer, share_of
 from edgefilter.diagnosis.select import search
 from edgefilter.diagnosis.trials import Found
 from edgefilter.echo.effects.catalogue import find
@@ -167,7 +167,8 @@ def add(
     values, straight = dict(model.effects), prepared.model
     for name in straightened:
         straight = straight.with_effect(name, values[name])
-    was, now = (compare(each, recording, reference, sample_rate=sample_rate).excess_db for each in (profile, knowing))
+    was = prepared.of(prepared.model).excess_db
+    now = compare(knowing, recording, reference, sample_rate=sample_rate).excess_db
     told = tuple(f"{name} is taken out first: {find(name).sentence(values[name])}" for name in straightened)
     told += (f"with that left in, as compare has it: {was:.1f} dB over the noise floor before, {now:.1f} dB after",)
     told_of = replace(prepared, warnings=(*told, *prepared.warnings))
@@ -202,16 +203,16 @@ def settle(
     return knowing, after, _as_written(found, prepared, dict(knowing.echo.effects), after)
 
 
-def _as_written(found: Diagnosis, prepared: Prepared, values: Mapping[str, Values], after: Comparison) -> Diagnosis:
+def _as_written(found: Diagnosis, prepared: Recording, values: Mapping[str, Values], after: Comparison) -> Diagnosis:
     """The diagnosis with the values of a profile that holds all its findings, and what each leaves then."""
     before = replace(describe(prepared, prepared.model), warnings=found.comparison.warnings)
-    model, scorer, excess_db = prepared.model, Scorer(prepared), before.excess_db
+    model, excess_db = prepared.model, before.excess_db
     findings: dict[str, Finding] = {}
     for finding in in_order(found.ranking):
         name, whole = finding.effect, before.excess_db
         model = model.with_effect(name, values[name])
         last = len(findings) == len(found.ranking) - 1
-        left_db = after.excess_db if last else scorer.of(model).excess_db
+        left_db = after.excess_db if last else prepared.of(model).excess_db
         share = max(share_of(whole, left_db) - share_of(whole, excess_db), 0.0)
         findings[name] = replace(
             finding,
@@ -235,7 +236,7 @@ def _as_written(found: Diagnosis, prepared: Prepared, values: Mapping[str, Value
 
 
 def conclude(
-    prepared: Prepared,
+    prepared: Recording,
     found: Found,
     criteria: Criteria,
     progress: Callable[[str], None] | None = None,
@@ -248,8 +249,13 @@ def conclude(
     believed = bool(found.steps) and _believed(found, criteria)
     quiet = found.base.excess_db < criteria.explained_db and not prepared.human
     verdict: Verdict = "missing" if found.steps and holds(found, criteria) else "explained" if quiet else "unexplained"
-    if not believed and (quiet or not _partly(found, criteria)):
-        found = _without_doubtful(found)
+    part = share_of(
+        found.base.excess_db, found.final.excess_db
+    )  # enough to be named beside something that none explains
+    partly = part >= criteria.half and explained_level(found) >= criteria.part_level
+    if not believed and (quiet or not partly):
+        shown = {step.name: step.values for step in found.steps if find(step.name).shows_in_silence}
+        found = found.with_only(shown)  # silences and voice both show it
     unpredictable = any(find(step.name).adds_noise for step in found.steps)
     remaining = found.final.excess_db
     findings, doubts = findings_of(found, progress)
@@ -265,7 +271,9 @@ def conclude(
         ),
         model=found.model,
         tried=tried,
-        independence=independence_of(found.prepared, found.model, found.final) if findings else comparison.independence,
+        independence=independence_of(found.recording, found.model, found.final)
+        if findings
+        else comparison.independence,
         precision=precision(found, findings),
         advice=(*advice(tried), *asks(tried)),
         closer_look=look_closer(found) if verdict == "unexplained" else None,
@@ -284,12 +292,6 @@ def _believed(found: Found, criteria: Criteria) -> bool:
     return found.final.excess_db < criteria.explained_db or (much and explained_level(found) >= criteria.half)
 
 
-def _partly(found: Found, criteria: Criteria) -> bool:
-    """Whether the findings explain enough to be named beside something that none explains."""
-    power = share_of(found.base.excess_db, found.final.excess_db)
-    return power >= criteria.half and explained_level(found) >= criteria.part_level
-
-
 def _much_left(found: Found, criteria: Criteria) -> bool:
     """Whether the findings leave so much, also of the samples that they were fitted to, that something else is there besides.
 
@@ -298,12 +300,6 @@ def _much_left(found: Found, criteria: Criteria) -> bool:
     silent = float(np.clip(found.final.silent_db, -0.5, 0.5))
     left = min(found.final.fitted_db, found.final.active_db) - silent
     return left > criteria.much_db and share_of(found.base.excess_db, found.final.excess_db) < criteria.nearly_all
-
-
-def _without_doubtful(found: Found) -> Found:
-    """The outcome of a search that explains too little, with nothing but what silences and voice both show."""
-    kept = {step.name: step.values for step in found.steps if find(step.name).shows_in_silence}
-    return found.with_only(Scorer(found.prepared), kept)
 
 
 def explained_level(found: Found) -> float:

@@ -7,9 +7,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from edgefilter.diagnosis.ordinary import p_value
-from edgefilter.diagnosis.prepare import Prepared
+from edgefilter.diagnosis.recording import Recording, share_of
 from edgefilter.diagnosis.result import Finding, Interval
-from edgefilter.diagnosis.score import Scorer, share_of
 from edgefilter.diagnosis.trials import Found, Trial, less
 from edgefilter.echo.effect import vanishes
 from edgefilter.echo.effects.catalogue import find
@@ -31,13 +30,13 @@ def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[t
     Each has the excess before and after it in the order of the steps. A change of the fan comes first only where it is
     more than all the rest.
     """
-    findings, doubts, before, scorer = [], [], found.base.excess_db, Scorer(found.prepared)
+    findings, doubts, before = [], [], found.base.excess_db
     for step in found.steps:
-        without_db = scorer.of(less(found.start, found.model, step.name)).level_db
+        without_db = found.recording.of(less(found.start, found.model, step.name)).level_db
         after = found.final.excess_db if step is found.steps[-1] else step.score.excess_db
         if progress:
             progress(f"how well {step.name} is known")
-        intervals, doubt = _intervals(found.prepared, found.model, step)
+        intervals, doubt = _intervals(found.recording, found.model, step)
         doubts += doubt
         findings.append(
             Finding(
@@ -74,19 +73,19 @@ def evidence_of(name: str, values: Values, start: EchoModel, otherwise: str) -> 
     return said + (HELD if held else "")
 
 
-def _intervals(prepared: Prepared, model: EchoModel, step: Trial) -> tuple[Mapping[str, Interval], list[str]]:
+def _intervals(recording: Recording, model: EchoModel, step: Trial) -> tuple[Mapping[str, Interval], list[str]]:
     """Each scalar parameter, or short list, with the interval from fits to a third of the recording each; which failed.
 
     Where fewer than two thirds can be fitted, a parameter may have any of its possible values.
     """
     if not find(step.name).told:
         return {}, []
-    block = np.arange(prepared.usable.size) // BLOCK
+    block = np.arange(recording.usable.size) // BLOCK
     others = model.without_effect(step.name)
     fits, failed = [], []
     for third in range(3):
         try:
-            part = prepared.behind(others).fitted_to(prepared.usable & (block % 3 == third))
+            part = recording.behind(others).fitted_to(recording.usable & (block % 3 == third))
             fits.append(others.fitted(step.name, part.measurement))
         except (UsageError, ArithmeticError, np.linalg.LinAlgError) as error:
             failed.append(

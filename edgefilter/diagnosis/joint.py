@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from edgefilter.diagnosis.criteria import Criteria
-from edgefilter.diagnosis.prepare import Prepared
+from edgefilter.diagnosis.recording import Recording
 from edgefilter.diagnosis.select import refit, standing
 from edgefilter.diagnosis.trials import Workbench
 from edgefilter.echo.effects.catalogue import find, names
@@ -35,7 +35,7 @@ def fit_jointly(measurement: Measurement, model: EchoModel, wanted: Sequence[str
     return best
 
 
-def fit_straight(prepared: Prepared, wanted: Sequence[str]) -> tuple[EchoModel, tuple[str, ...]]:
+def fit_straight(prepared: Recording, wanted: Sequence[str]) -> tuple[EchoModel, tuple[str, ...]]:
     """The prepared recording's model with those effects, fitted jointly, and with what the running filter follows.
 
     The names of the latter are the second answer: a drift or a turned volume of this recording would spoil the fit of the
@@ -93,7 +93,7 @@ def _straightened(bench: Workbench, model: EchoModel, followed: Sequence[str]) -
     while True:
         absent = [name for name in followed if name not in dict(model.effects)]
         trials = [trial for name in absent if (trial := bench.attempt(name, model)) is not None]
-        newest = bench.preferred(trial for trial in trials if bench.admissible(trial, model))
+        newest = bench.preferred(trial for trial in trials if bench.admissible(trial))
         if newest is None:
             return standing(bench, start, model)
         model = refit(bench, start, newest.model)

@@ -10,11 +10,9 @@ import numpy as np
 from edgefilter.diagnosis.closer_look import Curve
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.ordinary import p_value
-from edgefilter.diagnosis.score import Scorer
 from edgefilter.diagnosis.trials import Found, Trial, added
 from edgefilter.echo.effect import vanishes
 from edgefilter.echo.effects.catalogue import EFFECTS, find
-from edgefilter.echo.effects.free_laws import FreeLaw
 from edgefilter.echo.measurement import Values
 from edgefilter.errors import UsageError
 
@@ -89,11 +87,8 @@ def law_of(found: Found) -> Law | None:
         return None
     step = max(laws, key=lambda step: step.gain_db)
     effect, others = find(step.name), tuple(one.name for one in found.steps if one is not step)
-    curve = Curve.of(*_drawn(effect, step.values))
-    excess_db = found.final.excess_db
-    return Law(
-        step.name, effect.family, effect.sentence(step.values), curve, others, step.gain_db, excess_db, step.values
-    )
+    words, curve, excess_db = effect.sentence(step.values), Curve.of_law(step), found.final.excess_db
+    return Law(step.name, effect.family, words, curve, others, step.gain_db, excess_db, step.values)
 
 
 def with_laws(
@@ -108,13 +103,15 @@ def with_laws(
     to be there, has to predict more than they do. It is preferred only where it explains much more. What the law makes
     superfluous is dropped. None is looked for where the names leave as little as those of right ones do.
     """
-    scorer = Scorer(found.prepared)
     for _ in range(MOST):
         left = max(found.final.over_db - found.final.floor_db, 0.0)
         if found.final.excess_db <= (criteria.little_db if found.steps else criteria.explained_db):
             break
         names = {step.name for step in found.steps}
-        tried = [law for law in _trials(scorer, found, progress, without) if law.gain_db >= criteria.part * left]
+        if not (tried := list(_trials(found, progress, without))):
+            break
+        found = replace(found, laws=tuple(law for law in tried if names <= dict(law.model.effects).keys()))
+        tried = [law for law in tried if law.gain_db >= criteria.part * left]
         instead = [law for law in tried if not names <= dict(law.model.effects).keys()]
         beside = [law for law in tried if law not in instead and law.p_value <= criteria.false_rate]
         most = criteria.nearly * max((law.gain_db for law in (*instead, *beside)), default=0.0)
@@ -122,13 +119,11 @@ def with_laws(
         if not choices:
             break
         best = max(choices, key=lambda law: law.gain_db)
-        found = _with(scorer, found, _without_superfluous(scorer, found, best, criteria))
+        found = _with(found, _without_superfluous(found, best, criteria))
     return found
 
 
-def _trials(
-    scorer: Scorer, found: Found, progress: Callable[[str], None] | None, without: Collection[str]
-) -> Iterator[Trial]:
+def _trials(found: Found, progress: Callable[[str], None] | None, without: Collection[str]) -> Iterator[Trial]:
     """Each law beside all names, and in place of those of its family; how much more it explains than all names."""
     names = tuple(step.name for step in found.steps)
     for effect in EFFECTS:
@@ -138,49 +133,42 @@ def _trials(
             progress(f"trying {effect.title}")
         others = tuple(name for name in names if find(name).free or find(name).family != effect.family)
         for kept in dict.fromkeys((names, others)):
-            if tried := _tried(scorer, found, effect.name, kept):
+            if tried := _tried(found, effect.name, kept):
                 yield tried
 
 
-def _tried(scorer: Scorer, found: Found, name: str, kept: Iterable[str]) -> Trial | None:
+def _tried(found: Found, name: str, kept: Iterable[str]) -> Trial | None:
     """A law fitted beside some of the names; None where its fit finds nothing."""
     others, known = found.start, dict(found.model.effects)
     for other in kept:
         others = others.with_effect(other, known[other])
     try:
-        values = others.fitted(name, scorer.behind(others).measurement)
+        values = others.fitted(name, found.recording.behind(others).measurement)
     except (UsageError, ArithmeticError, np.linalg.LinAlgError):
         return None
     if vanishes(find(name), values):
         return None
     model = others.with_effect(name, values)
-    return Trial.of(name, model, found.final, scorer.of(model))
+    return Trial.of(name, model, found.final, found.recording.of(model))
 
 
-def _without_superfluous(scorer: Scorer, found: Found, law: Trial, criteria: Criteria) -> Trial:
+def _without_superfluous(found: Found, law: Trial, criteria: Criteria) -> Trial:
     """The law without the names beside which it explains no more than by chance."""
     for name in added(found.start, law.model)[:-1]:
         *kept, _ = added(found.start, law.model)
-        alone = _tried(scorer, found, law.name, [other for other in kept if other != name])
+        alone = _tried(found, law.name, [other for other in kept if other != name])
         if alone and p_value(name, law.gain_db - alone.gain_db) > criteria.false_rate:
             law = alone
     return law
 
 
-def _with(scorer: Scorer, found: Found, law: Trial) -> Found:
+def _with(found: Found, law: Trial) -> Found:
     """The outcome with a law; like: the strongest name that the law replaces."""
     family, values = find(law.name).family, dict(law.model.effects)
     replaced = [step for step in found.steps if step.name not in values and find(step.name).family == family]
     like = {law.name: replaced[0].name} if replaced else {}
-    outcome = found.with_only(scorer, {name: values[name] for name in added(found.start, law.model)})
+    outcome = found.with_only({name: values[name] for name in added(found.start, law.model)})
     return replace(outcome, like={**found.like, **like})
-
-
-def _drawn(effect: object, values: Values) -> tuple:
-    """The arguments of Curve.of for a law."""
-    assert isinstance(effect, FreeLaw)
-    name, unit, x, y, y_unit = effect.drawn(values)
-    return name, unit, x, y, 1.0, y_unit
 
 
 def _given(effect: str, key: str) -> bool:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgefilter.diagnosis.score import Scorer
+from edgefilter.diagnosis.recording import bands
 from edgefilter.diagnosis.trials import Found
 from edgefilter.dsp.frames import block_power, blocks, decibels
 from edgefilter.dsp.tones import tones
@@ -47,7 +47,7 @@ def leftover(found: Found) -> Leftover:
 
 def left_in_words(found: Found, left: Leftover, remaining_db: float, floor_db: float) -> str:
     """What is in the residual that no finding explains; empty where it is the fan."""
-    spans = ", ".join(f"{begin:.1f} to {end:.1f} s" for begin, end in found.prepared.human)
+    spans = ", ".join(f"{begin:.1f} to {end:.1f} s" for begin, end in found.recording.human)
     talk = f"somebody talks at {spans}, left out of all figures" if spans else ""
     if remaining_db < floor_db:
         return talk
@@ -62,7 +62,7 @@ def left_in_words(found: Found, left: Leftover, remaining_db: float, floor_db: f
         words.append(f"sound of its own while the robot is silent{swings}")
     if found.final.active_db - max(quiet_db, 0.0) > 1.0:
         weights = 10 * np.log10(np.maximum(found.final.cells, 1e-3)).mean(axis=0)
-        low, high = Scorer(found.prepared).band_hz[int(np.argmax(weights))]
+        low, high = bands().hz[int(np.argmax(weights))]
         words.append(f"a residual that follows the robot's voice, strongest around {low:.0f} to {high:.0f} Hz")
     return "what no effect of the catalogue explains: " + "; ".join(
         words or ["a residual spread over the whole recording"]

@@ -23,8 +23,6 @@ SMALL = 1e-6
 """Of the fan's power: a number that changes less than that is read off a filter and moves nothing by itself."""
 TOLD = 0.1
 """Correlation from which on it is told: less widens neither error by more than 0.5 %."""
-MOST = 16
-"""Numbers whose derivatives are taken: each costs a prediction."""
 
 
 def precision(found: Found, findings: Sequence[Finding]) -> Precision:
@@ -34,8 +32,14 @@ def precision(found: Found, findings: Sequence[Finding]) -> Precision:
     standing for what is independent: speech and fan are neither white nor stationary. Filters of many taps, and the
     numbers that are read off them, stay as they are; these have the scatter of fits to a third of the recording each.
     """
-    entries = [entry for finding in findings for entry in _numbers(finding)]
-    moved = {i: x for i, entry in enumerate(entries[:MOST]) if (x := _derivative(found, *entry)) is not None}
+    entries = [
+        (finding, parameter, index)
+        for finding in findings
+        for parameter in find(finding.effect).told
+        if parameter.name in finding.parameters
+        for index in range(np.size(finding.parameters[parameter.name].value))
+    ]
+    moved = {i: x for i, entry in enumerate(entries) if (x := _derivative(found, *entry)) is not None}
     covariance = _covariance(found, np.stack(list(moved.values()))) if moved else None
     if covariance is None:
         return Precision(tuple(_known(entry, None) for entry in entries))
@@ -47,16 +51,6 @@ def precision(found: Found, findings: Sequence[Finding]) -> Precision:
         if abs(r) >= TOLD:
             shared.append((numbers[i].label, numbers[j].label, r))
     return Precision(numbers, tuple(sorted(shared, key=lambda entry: -abs(entry[2]))))
-
-
-def _numbers(finding: Finding) -> list[tuple[Finding, Parameter, int]]:
-    """Each number of a finding that has an interval."""
-    return [
-        (finding, parameter, index)
-        for parameter in find(finding.effect).told
-        if parameter.name in finding.parameters
-        for index in range(np.size(finding.parameters[parameter.name].value))
-    ]
 
 
 def _half_width(finding: Finding, parameter: Parameter, index: int) -> float | None:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import cast
+from dataclasses import replace
 
 import numpy as np
 import soxr
@@ -13,22 +12,19 @@ from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 from edgefilter.alignment.belief import LEADS, Belief, believe, find_lag
 from edgefilter.calibration.from_recording import TAIL_S
+from edgefilter.diagnosis.recording import FRAME, Recording
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.dsp.frames import all_block_power, blocks, decibels
 from edgefilter.dsp.lag import correlation_near, highest, likely_cross, top
 from edgefilter.dsp.psd import floored, hann
-from edgefilter.dsp.stft import StftConfig
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.lag_track import track_lag
 from edgefilter.echo.measurement import STEADY_DB, Measurement, whiten
-from edgefilter.echo.model import EchoModel
 from edgefilter.echo.recording import fitted_blocks, paired
 from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples, as_samples
 
-FRAME, HOP = StftConfig.n_fft, StftConfig.hop
-"""Samples of the frames that a prediction is judged in, those of the running filter."""
 TRACK_REACH = 1600
 """Samples (0.1 s) by which the lag may move away from that of the whole recording and still be followed."""
 SILENCE_DB = -15.0
@@ -47,55 +43,7 @@ PAUSE_S, LAG_STEP = 0.5, 480
 then: less is left for the effects to explain."""
 
 
-@dataclass(frozen=True, eq=False)
-class Prepared:
-    """A recording beside what the profile predicts, on one sample counter; all arrays (n,).
-
-    measurement: aligned reference, recording, the fan's PSD, the samples to fit on. model: the profile's, less the
-    events of other recordings. prediction: of that model. usable: samples where nobody else talks. active: where the
-    robot is heard. offset: samples of lag against the calibration. human: (start_s, end_s) of other talkers. ordinary:
-    the robot's own distortion, as calibrated, in the form of EchoModel.unpredictable.
-    """
-
-    measurement: Measurement
-    model: EchoModel
-    prediction: Samples
-    usable: NDArray[np.bool_]
-    active: NDArray[np.bool_]
-    offset: float
-    human: tuple[tuple[float, float], ...] = ()
-    warnings: tuple[str, ...] = ()
-    ordinary: tuple[tuple[Samples, Array], ...] = ()
-
-    @property
-    def held_out(self) -> NDArray[np.bool_]:
-        """Samples that no fit has used, (n,)."""
-        return self.usable & ~self.fit
-
-    @property
-    def fit(self) -> NDArray[np.bool_]:
-        """The samples to fit on, which prepare() always marks, (n,)."""
-        return cast("NDArray[np.bool_]", self.measurement.fit)
-
-    @property
-    def noise_psd(self) -> Samples:
-        """The fan's PSD, which prepare() always knows, (601,)."""
-        return cast(Samples, self.measurement.noise_psd)
-
-    def behind(self, model: EchoModel) -> Prepared:
-        """The same with the fan that a model expects; itself where that is the profile's."""
-        was, now = (each.expected_noise(self.noise_psd) for each in (self.model, model))
-        if np.array_equal(was, now):
-            return self
-        psd = floored(self.noise_psd * (now / was)).astype(np.float32)
-        return replace(self, measurement=replace(self.measurement, noise_psd=psd), model=model)
-
-    def fitted_to(self, fit: NDArray[np.bool_]) -> Prepared:
-        """The same with other samples to fit on, (n,)."""
-        return replace(self, measurement=replace(self.measurement, fit=fit))
-
-
-def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_rate: int = SAMPLE_RATE) -> Prepared:
+def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_rate: int = SAMPLE_RATE) -> Recording:
     """Resample to 16 kHz, find the constant lag, mark the robot's silence and the blocks that fits may use.
 
     recording (m,), reference (k,): float, full scale +-1, at sample_rate. Raises SignalError for less than a second or
@@ -148,7 +96,7 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
         warnings += (f"the utterances lag by different numbers of samples: {lags}; aligned one by one",)
     measurement = Measurement(x, y, psd, fitted_blocks(n) & usable, calibrated)
     ordinary = ordinary_distortion(profile, predicted)
-    return Prepared(measurement, model, predicted, usable, active, offset, human, warnings, ordinary)
+    return Recording(measurement, model, predicted, usable, active, offset, human, warnings, ordinary)
 
 
 def leads(lag: float) -> str:

@@ -14,15 +14,14 @@ from edgefilter.calibration.multisine import BAND_HZ, SPEECH_DB
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import holds
 from edgefilter.diagnosis.joint import fit_jointly
-from edgefilter.diagnosis.prepare import HOP, Prepared, prepare
-from edgefilter.diagnosis.score import STEP, Scorer
+from edgefilter.diagnosis.prepare import prepare
+from edgefilter.diagnosis.recording import HOP, STEP, Recording, Score, bands
 from edgefilter.diagnosis.trials import Found
 from edgefilter.dsp.convolution import convolve
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.dsp.frames import decibels
 from edgefilter.dsp.psd import GRID_BINS, coloured, frequencies
 from edgefilter.echo.effects.catalogue import find
-from edgefilter.echo.evidence import Score
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import SignalError, UsageError
@@ -134,7 +133,7 @@ class Heard:
     Each with the explanations as fitted to the first recording and to that half.
     """
 
-    halves: tuple[tuple[Prepared, list[Explanation]], ...]
+    halves: tuple[tuple[Recording, list[Explanation]], ...]
 
     @cached_property
     def evidence(self) -> Array:
@@ -156,17 +155,17 @@ class Inquiry:
             raise UsageError(f"{name} belongs to one recording, and no other can tell of it: ask without it")
         self.profile, self.reference = profile, reference
         self._first = prepare(profile, recording, reference)
-        scorer, measurement = Scorer(self._first), self._first.measurement
+        measurement = self._first.measurement
         kept: list[Explanation] = []
         voices: list[Samples] = []
         for effects in wanted:
             model = _fitted(measurement, self._first.model, effects)
-            power, expected, voice = _cells(scorer, model)
+            power, expected, voice = _cells(self._first, model)
             over = np.maximum(np.sum(power - expected, axis=0), 0.0) / np.maximum(np.sum(voice, axis=0), 1e-12)
             heard = measurement.predicted(model)[1]
             noisy = model.unpredictable(measurement.reference) or any(find(name).stage == "noise" for name in effects)
             if noisy or all(np.sum((heard - other) ** 2) > TWINS * np.sum(other**2) for other in voices):
-                error = np.interp(frequencies(GRID_BINS), scorer.band_hz.mean(axis=1), over)
+                error = np.interp(frequencies(GRID_BINS), bands().hz.mean(axis=1), over)
                 kept.append(Explanation(effects, model.lasting(), error))
                 voices.append(heard)
         self.explanations = tuple(kept)
@@ -186,7 +185,7 @@ class Inquiry:
             tuple((half, [self._again(one, half.model, first, half) for one in self.explanations]) for half in halves)
         )
 
-    def _again(self, one: Explanation, start: EchoModel, *parts: Prepared) -> Explanation:
+    def _again(self, one: Explanation, start: EchoModel, *parts: Recording) -> Explanation:
         """The same fitted to the first recording and others, as one.
 
         What a clock does begins anew with each recording, so that a model of one stays as it is.
@@ -372,7 +371,7 @@ def _fitted(measurement: Measurement, model: EchoModel, effects: Sequence[str]) 
         raise SignalError(f"{'+'.join(effects)} cannot be fitted to the recording: {error}") from None
 
 
-def _halves(prepared: Prepared) -> tuple[Prepared, Prepared]:
+def _halves(prepared: Recording) -> tuple[Recording, Recording]:
     """The same with one half to fit to and the other to test on, and the other way round."""
     return prepared, prepared.fitted_to(prepared.held_out)
 
@@ -395,15 +394,15 @@ def _simulated(profile: Profile, true: Explanation, sound: Samples) -> Samples:
     return heard.astype(np.float32)
 
 
-def _found(prepared: Prepared, model: EchoModel) -> Found:
+def _found(prepared: Recording, model: EchoModel) -> Found:
     """What a model leaves of a recording, as a search says it that ends with that model."""
-    scorer, start = Scorer(prepared), prepared.model
-    return Found(prepared, start, model, scorer.of(start), scorer.of(model), ())
+    start = prepared.model
+    return Found(prepared, start, model, prepared.of(start), prepared.of(model), ())
 
 
 def _as_one(found: Sequence[Found]) -> Found:
     """What a model leaves of several recordings, scored as one of that length: levels in the mean, excess in mean power."""
-    seconds = [np.count_nonzero(each.prepared.held_out) for each in found]
+    seconds = [np.count_nonzero(each.recording.held_out) for each in found]
 
     def joined(scores: Sequence[Score]) -> Score:
         def level(name: str) -> float:
@@ -426,33 +425,32 @@ def _as_one(found: Sequence[Found]) -> Found:
     return replace(found[0], base=joined([one.base for one in found]), final=joined([one.final for one in found]))
 
 
-def _cells(scorer: Scorer, model: EchoModel) -> tuple[Array, Array, Array]:
+def _cells(recording: Recording, model: EchoModel) -> tuple[Array, Array, Array]:
     """The power that a model leaves, what it expects, and its voice, over the known fan, (moments, bands) each."""
-    score = scorer.of(model)
-    power = scorer.cells(scorer.measurement.recording - score.prediction)
-    return power, power / score.cells, scorer.cells(score.prediction)
+    score = recording.of(model)
+    power = recording.cells(recording.measurement.recording - score.prediction)
+    return power, power / score.cells, recording.cells(score.prediction)
 
 
-def _log_likelihood(prepared: Prepared, explanations: Sequence[Explanation]) -> Array:
+def _log_likelihood(prepared: Recording, explanations: Sequence[Explanation]) -> Array:
     """Log likelihood of the cells that no fit has used, (moments, explanations + 1), the last of none of them.
 
     Student's t with as many degrees of freedom as the cell has (Lange, Little & Taylor 1989): what is louder than
     expected counts by its level, and what was expected in vain counts as well.
     """
-    scorer = Scorer(prepared)
-    freedom = scorer.freedom * (STEP / (HOP - 1))
+    freedom = bands().freedom * (STEP / (HOP - 1))
 
     def likelihood(power: Array, expected: Array) -> Array:
         return -0.5 * np.sum(freedom * (np.log(expected) + 2.0 * np.log1p(power / expected)), axis=1)
 
     columns, vague = [], []
     for each in explanations:
-        power, expected, voice = _cells(scorer, each.model)
-        error = np.interp(scorer.band_hz.mean(axis=1), frequencies(GRID_BINS), each.error)
+        power, expected, voice = _cells(prepared, each.model)
+        error = np.interp(bands().hz.mean(axis=1), frequencies(GRID_BINS), each.error)
         expected = expected + error * voice
         columns.append(likelihood(power, expected))
         vague.append(likelihood(power, NONE * expected))
-    if not scorer.starts.size:
+    if not prepared.starts.size:
         raise SignalError("too little of the recording can be evaluated: expected two seconds in which nobody talks")
     best = int(np.argmax([column.sum() for column in columns]))
     return np.stack([*columns, vague[best]], axis=1)

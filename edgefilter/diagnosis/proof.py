@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 from edgefilter.calibration.from_recording import self_calibrate
 from edgefilter.diagnosis.compare import rounded
 from edgefilter.diagnosis.joint import fit_straight
-from edgefilter.diagnosis.prepare import Prepared, prepare
+from edgefilter.diagnosis.prepare import prepare
+from edgefilter.diagnosis.recording import Recording
 from edgefilter.dsp.frames import block_power, decibels
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
@@ -65,16 +67,17 @@ class Proof:
 
 
 class HeldOut:
-    """A recording cut in two at a pause: a part to fit to, and the robot alone of the rest, for a filter that begins.
+    """A recording (n,) cut in two at a pause: a part to fit to, and the robot alone of the rest, for a filter that begins.
 
-    profile: by which recording (n,) and reference (m,), both at 16 kHz, are aligned. Raises SignalError where either
-    part holds less than LEAST_S of the robot.
+    profile: as of `prove`. seconds: of the robot alone in that rest. Raises SignalError where either part holds less than
+    LEAST_S of the robot.
     """
 
-    def __init__(self, profile: Profile, recording: Samples, reference: Samples) -> None:
-        self._prepared = prepare(profile, recording, reference)
-        robot = self._prepared.usable & self._prepared.active
-        self.cut = _cut(self._prepared.prediction, robot)
+    def __init__(self, profile: Profile | None, recording: Samples, reference: Samples) -> None:
+        self._profile = profile
+        self._prepared = prepared = prepare(profile or self_calibrate(recording, reference), recording, reference)
+        robot = prepared.usable & prepared.active
+        self.cut = _cut(prepared.prediction, robot)
         self._tested = robot[self.cut :]
         self.seconds = float(np.count_nonzero(self._tested)) / SAMPLE_RATE
         shortest = min(self.seconds, float(np.count_nonzero(robot[: self.cut])) / SAMPLE_RATE)
@@ -83,11 +86,24 @@ class HeldOut:
                 f"too little of the robot alone to hold seconds out and prove a fit on them: {shortest:.1f} s, expected"
                 f" {LEAST_S:g} s in each part of the recording; give a longer one, or --force"
             )
+        self._first = profile or self_calibrate(recording[: self.cut], reference)
+        early = prepared if profile else prepare(self._first, recording, reference)
+        before = np.arange(early.usable.size) < self.cut
+        self._early = replace(early.fitted_to(early.fit & before), usable=early.usable & before)
 
-    def before(self, prepared: Prepared) -> Prepared:
-        """The prepared recording with nothing to fit to, or to test on, from the cut on."""
-        first = np.arange(prepared.usable.size) < self.cut
-        return replace(prepared.fitted_to(prepared.fit & first), usable=prepared.usable & first)
+    def proof(self, names: Sequence[str]) -> Proof:
+        """The proof of effects, fitted to the first part."""
+        proof = Proof(tuple(names), self.cut / SAMPLE_RATE, self.seconds, self._erle_before_db, self._erle_with(names))
+        if not proof.worse or len(names) < 2:
+            return proof
+        return replace(proof, without=tuple((name, self._erle_with([n for n in names if n != name])) for name in names))
+
+    @cached_property
+    def _erle_before_db(self) -> float:
+        return self.erle_db(self._profile)
+
+    def _erle_with(self, names: Sequence[str]) -> float:
+        return self.erle_db(with_fitted(self._first, self._early, names)[0])
 
     def erle_db(self, profile: Profile | None) -> float:
         """ERLE of the running filter with that profile over the held-out seconds of the robot alone, dB."""
@@ -143,30 +159,18 @@ def prove(profile: Profile | None, names: str | Sequence[str], recording: Sample
     >>> proof.worse, proof.erle_after_db > proof.erle_before_db + 3
     (False, True)
     """
-    names = listed(names)
-    known = profile or self_calibrate(recording, reference)
-    held = HeldOut(known, recording, reference)
-    first = profile or self_calibrate(recording[: held.cut], reference)
-    early = held.before(prepare(first, recording, reference))
-
-    def erle_with(wanted: tuple[str, ...]) -> float:
-        return held.erle_db(with_fitted(first, early, wanted)[0])
-
-    proof = Proof(names, held.cut / SAMPLE_RATE, held.seconds, held.erle_db(profile), erle_with(names))
-    if not proof.worse or len(names) < 2:
-        return proof
-    others = ((name, erle_with(tuple(other for other in names if other != name))) for name in names)
-    return replace(proof, without=tuple(others))
+    return HeldOut(profile, recording, reference).proof(listed(names))
 
 
 def proofs_until_kept(
     profile: Profile | None, names: str | Sequence[str], recording: Samples, reference: Samples
 ) -> tuple[Proof, ...]:
     """`prove` of all names, then without the one that does most harm, while there is one: the last names what is kept."""
-    proofs = [prove(profile, names, recording, reference)]
+    held = HeldOut(profile, recording, reference)
+    proofs = [held.proof(listed(names))]
     while proofs[-1].worse and (culprit := proofs[-1].culprit):
         kept = tuple(name for name in proofs[-1].effects if name != culprit)
-        proofs.append(prove(profile, kept, recording, reference))
+        proofs.append(held.proof(kept))
     return tuple(proofs)
 
 
@@ -181,7 +185,7 @@ def lasts(name: str) -> bool:
 
 
 def with_fitted(
-    profile: Profile, prepared: Prepared, names: Sequence[str]
+    profile: Profile, prepared: Recording, names: Sequence[str]
 ) -> tuple[Profile, EchoModel, tuple[str, ...]]:
     """The profile with those effects fitted; the fitted model and the names of what was straightened in it."""
     model, straightened = fit_straight(prepared, names) if names else (prepared.model, ())

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import diagnose
-from edgefilter.diagnosis.proof import HeldOut, Proof, lasts, prove
+from edgefilter.diagnosis.proof import HeldOut, Proof, lasts
 from edgefilter.diagnosis.result import Candidate, Diagnosis
 from edgefilter.errors import SignalError
 from edgefilter.profile.data import Profile
@@ -65,20 +65,22 @@ def diagnose_proven(
     ('playback_gain', False)
     """
     disproved: dict[str, Proof] = {}
+    held, too_short = None, ""
     try:
-        stop, too_short = HeldOut(profile, recording, reference).cut, ""
+        held = HeldOut(profile, recording, reference)
     except SignalError as error:
-        stop, too_short = recording.size, str(error)
+        too_short = str(error)
+    stop = held.cut if held else recording.size
     while True:
         found = diagnose(
             profile, recording[:stop], reference[:stop], progress=progress, criteria=criteria, without=disproved
         )
         names = tuple(finding.effect for finding in found.ranking if lasts(finding.effect))
-        if too_short or not names:
+        if not held or not names:
             return _told(found, disproved, unproven=too_short if names else "nothing lasting was found")
         if progress:
             progress("the running filter without and with what was found")
-        proof = prove(profile, names, recording, reference)
+        proof = held.proof(names)
         if not proof.worse:
             return _told(found, disproved, proof)
         disproved[proof.culprit or names[0]] = proof

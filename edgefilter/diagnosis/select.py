@@ -2,8 +2,7 @@
 
 Forward: every effect is fitted beside those accepted so far, and the simplest of those that no other outdoes is
 accepted. Refit: all are fitted beside each other. Backward: what the newest one has made superfluous is exchanged for
-something simpler, or dropped. Stepwise selection ends in local optima; so it is begun anew from the next best effects
-where the best one does not lead to an explanation.
+something simpler, or dropped.
 """
 
 from __future__ import annotations
@@ -13,8 +12,8 @@ from itertools import pairwise
 
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.ordinary import p_value
-from edgefilter.diagnosis.prepare import Prepared
-from edgefilter.diagnosis.trials import Found, Trial, Workbench, added
+from edgefilter.diagnosis.recording import Recording
+from edgefilter.diagnosis.trials import Found, Trial, Workbench, added, noisy
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
 
@@ -22,97 +21,43 @@ FULL = "the search ended at {} effects with some error left: something further m
 
 
 def search(
-    prepared: Prepared,
+    recording: Recording,
     model: EchoModel,
     criteria: Criteria,
     progress: Callable[[str], None] | None = None,
     without: Collection[str] = (),
 ) -> Found:
     """Add effects, others than those named in without, to model as long as held-out samples say that they are there."""
-    bench = Workbench(prepared, criteria, progress, without, model)
-    best = _best(bench, model, list(_runs(bench, model)))
+    bench = Workbench(recording, criteria, progress, without, model)
+    best = min(_stepwise(bench, model), key=lambda step: bench.score(step).level_db)
     steps = _in_steps(bench, model, best)
-    full = len(added(model, best)) >= criteria.most_effects and not bench.explained(best)
+    full = len(steps) >= criteria.most_effects and not bench.explained(best)
     notes = (*bench.notes, FULL.format(criteria.most_effects)) if full else bench.notes
-    return Found(prepared, model, best, bench.score(model), bench.score(best), steps, notes, bench.tried(model, best))
+    return Found(recording, model, best, bench.score(model), bench.score(best), steps, notes, bench.tried(model, best))
 
 
-def _runs(bench: Workbench, start: EchoModel) -> Iterator[EchoModel]:
-    """What each beginning leads to, until one explains nearly all: of all its steps, what explains most by effects that can be named."""
-    criteria = bench.criteria
-    known: set[frozenset[str]] = set()
-    for first in _starts(bench, start):
-        steps = [standing(bench, start, step) for step in _stepwise(bench, start, first, known)]
-        run = min(steps, key=lambda step: bench.score(step).level_db)
-        yield run
-        if (
-            bench.explained(run)
-            or bench.left(run) <= (1.0 - criteria.nearly) * bench.left(start)
-            or bench.little(run, start)
-        ):
-            return
+def _stepwise(bench: Workbench, start: EchoModel) -> Iterator[EchoModel]:
+    """The start, then step by step with what explains a good part of what is left, of each step what can be named.
 
-
-def _starts(bench: Workbench, start: EchoModel) -> Iterator[Trial]:
-    """The trial to begin with, then others that explain a good part of something else, named or not: what hides them may be found beside them."""
-    criteria = bench.criteria
-    if bench.off_db(start) <= criteria.silent_db:
-        return
-    trials = bench.attempt_all(start)
-    first = bench.preferred(t for t in trials if bench.admissible(t, start))
-    if first is not None:
-        yield first
-    least = criteria.part * bench.left(start)
-    others = [t for t in trials if t is not first and not find(t.name).last_resort and t.gain_db >= least]
-    others = [t for t in others if first is None or not _same(bench, start, first, t)]
-    yield from sorted(others, key=lambda t: -t.gain_db)[: criteria.starts]
-
-
-def _same(bench: Workbench, start: EchoModel, one: Trial, other: Trial) -> bool:
-    """Whether two effects are two names for the same: as much is left by both, and beside either the other explains next to nothing."""
-    if bench.halves(other, one.model) or bench.halves(one, other.model):
-        return False
-    least = bench.criteria.nothing * bench.left(start)
-    pairs = ((one, other.name), (other, one.name))
-    return all((again := bench.attempt_alike(name, t.model)) is None or again.gain_db < least for t, name in pairs)
-
-
-def _stepwise(bench: Workbench, start: EchoModel, first: Trial, known: set[frozenset[str]]) -> Iterator[EchoModel]:
-    """The model with first, then step by step with what explains a good part of what is left.
-
-    known: the sets of effects that earlier runs have held, which those of this one join: where it meets an earlier run, it ends.
+    Beside noise that explains all a waveform is looked for once more: it may explain some of that.
     """
-    model = split(bench, start, first.model)
-    known.add(frozenset(added(start, model)))
-    yield model
-    while len(added(start, model)) < bench.criteria.most_effects and not bench.explained(model):
+    yield start
+    model, enough_db = start, bench.criteria.silent_db
+    while len(added(start, model)) < bench.criteria.most_effects and (bench.off_db(model) > enough_db or noisy(model)):
         bench.so_far(model)
-        newest = forward(bench, model) or doubtful(bench, model)
-        if newest is None or (held := frozenset(added(start, newest.model))) in known:
-            break
-        known.add(held)
+        newest = forward(bench, model)
+        if newest is None:
+            return
         grown = split(bench, start, backward(bench, start, refit(bench, start, newest.model), newest.name))
         if bench.score(grown).level_db >= bench.score(model).level_db:
-            break
-        model = grown
-        yield model
-        known.add(frozenset(added(start, model)))
+            return
+        model, enough_db = grown, bench.criteria.heard_db
+        yield standing(bench, start, model)
 
 
 def forward(bench: Workbench, model: EchoModel, most: int = 9) -> Trial | None:
-    """The effect to accept next: it explains a good part of what is left, and looks like what it is."""
-    return bench.preferred(t for t in _much(bench, model, most) if bench.admissible(t, model))
-
-
-def doubtful(bench: Workbench, model: EchoModel) -> Trial | None:
-    """The effect to go on with where none looks like what it is: it may not do so before another one is found beside it."""
-    return bench.preferred(t for t in _much(bench, model, 9) if t.p_value <= bench.criteria.false_rate)
-
-
-def _much(bench: Workbench, model: EchoModel, most: int) -> list[Trial]:
-    """Trials that explain a good part of what is left."""
-    least = bench.criteria.part * bench.left(model)
-    return [t for t in bench.attempt_all(model, most) if t.gain_db >= least or bench.halves(t, model)]
+    """The effect to accept next: it explains a good part of what is left."""
+    return bench.preferred(trial for trial in bench.attempt_all(model, most) if bench.worth(trial, model))
 
 
 def refit(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
@@ -152,7 +97,7 @@ def _exchange(bench: Workbench, start: EchoModel, model: EchoModel, name: str) -
     """The model with another effect instead of that one where, beside the others, the other is the one to name."""
     others = bench.less(model, name)
     trials = bench.attempt_all(others, find(name).complexity)
-    rivals = [t for t in trials if t.name != name and not find(t.name).last_resort and bench.admissible(t, others)]
+    rivals = [t for t in trials if t.name != name and not find(t.name).last_resort and bench.admissible(t)]
     chosen = bench.preferred([*rivals, bench.beside(name, others, model)])
     if chosen is None or chosen.name == name:
         return model
@@ -193,28 +138,11 @@ def _apart(bench: Workbench, model: EchoModel, name: str) -> EchoModel:
     return both if left <= (1.0 - bench.criteria.nearly) * lost else model
 
 
-def _best(bench: Workbench, start: EchoModel, runs: list[EchoModel]) -> EchoModel:
-    """The run that explains most, or the earlier and simpler one where others hardly explain more."""
-    base = bench.score(start).level_db
-    best = start
-    for run in sorted(runs, key=lambda run: sum(find(name).complexity for name in added(start, run))):
-        most = base - bench.score(run).level_db
-        if base - bench.score(best).level_db < bench.criteria.nearly * most:
-            best = run
-    return best
-
-
 def standing(bench: Workbench, start: EchoModel, run: EchoModel) -> EchoModel:
     """The run without the effects that cannot be named beside its others, the latest first."""
-    while fallen := [name for name in added(start, run) if not _stands(bench, run, name)]:
-        run = bench.less(run, fallen[-1])
-    return run
-
-
-def _stands(bench: Workbench, model: EchoModel, name: str) -> bool:
-    """Whether an effect can be named beside the model's others."""
-    others = bench.less(model, name)
-    return bench.admissible(bench.beside(name, others, model), others)
+    beside = [bench.beside(name, bench.less(run, name), run) for name in added(start, run)]
+    fallen = [trial.name for trial in beside if not bench.admissible(trial)]
+    return standing(bench, start, bench.less(run, fallen[-1])) if fallen else run
 
 
 def _in_steps(bench: Workbench, start: EchoModel, model: EchoModel) -> tuple[Trial, ...]:

@@ -10,12 +10,10 @@ from typing import TypeAlias
 import numpy as np
 
 from edgefilter.diagnosis.criteria import Criteria
-from edgefilter.diagnosis.ordinary import p_value, percent
-from edgefilter.diagnosis.prepare import Prepared
-from edgefilter.diagnosis.score import Scorer
+from edgefilter.diagnosis.ordinary import p_value
+from edgefilter.diagnosis.recording import Recording, Score
 from edgefilter.echo.effect import vanishes
 from edgefilter.echo.effects.catalogue import find, names
-from edgefilter.echo.evidence import Evidence, Score
 from edgefilter.echo.measurement import STEADY_DB, Values
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import UsageError
@@ -48,14 +46,12 @@ class Trial:
 class Tried:
     """What came of one effect in a search: beside the start alone, and beside what the search has found; None where it was not fitted.
 
-    short: why it could not be named beside the start, empty where it could. failed: why its fit failed. spared: whether
-    it was not even fitted, since what is left is too little for it to be named.
+    failed: why its fit failed. spared: whether it was not even fitted, since what is left is too little for it to be named.
     """
 
     name: str
     alone: Trial | None
     beside: Trial | None
-    short: str = ""
     failed: str = ""
     spared: bool = False
 
@@ -65,10 +61,10 @@ class Found:
     """The outcome of a search from a start model.
 
     steps: the accepted effects in their order. notes: what the reader must know of the search. tried: every effect that
-    was fitted. like: of a free law the name of its family that it replaces.
+    was fitted. like: of a free law the name of its family that it replaces. laws: those that were fitted beside all steps.
     """
 
-    prepared: Prepared
+    recording: Recording
     start: EchoModel
     model: EchoModel
     base: Score
@@ -77,55 +73,51 @@ class Found:
     notes: tuple[str, ...] = ()
     tried: tuple[Tried, ...] = ()
     like: Mapping[str, str] = field(default_factory=dict)
+    laws: tuple[Trial, ...] = ()
 
-    def with_only(self, scorer: Scorer, values: Mapping[str, Values]) -> Found:
+    def with_only(self, values: Mapping[str, Values]) -> Found:
         """The outcome with nothing but these effects, each with what it explains beside those before it."""
         model, score, steps = self.start, self.base, []
         for name, of in values.items():
             model, before = model.with_effect(name, of), score
-            score = scorer.of(model)
+            score = self.recording.of(model)
             steps.append(Trial.of(name, model, before, score))
         return replace(self, model=model, final=score, steps=tuple(steps))
 
     @cached_property
-    def in_noise(self) -> Prepared:
-        """The recording prepared with the fan that was found."""
-        return self.prepared.behind(self.model)
+    def in_noise(self) -> Recording:
+        """The recording with the fan that was found."""
+        return self.recording.behind(self.model)
 
 
 class Workbench:
-    """Tries effects on models of one prepared recording and remembers what came of it."""
+    """Tries effects on models of one recording and remembers what came of it."""
 
     def __init__(
         self,
-        prepared: Prepared,
+        recording: Recording,
         criteria: Criteria,
         progress: Callable[[str], None] | None = None,
         without: Collection[str] = (),
         start: EchoModel | None = None,
     ) -> None:
-        self.prepared, self.criteria = prepared, criteria
-        self._start = start or prepared.model
+        self.recording, self.criteria = recording, criteria
+        self._start = start or recording.model
         # what the start has at neutral values is in its path (Effect.absorbed): no search claims it
         taken_up = (name for name, values in self._start.effects if vanishes(find(name), values))
         self._without = {*without, *taken_up}
-        self.scorer = Scorer(prepared)
         self._progress = progress
         self._scores: dict[Signature, Score] = {}
         self._trials: dict[tuple[Signature, str], Trial | None] = {}
         self._alike: dict[tuple[frozenset[str], str], Trial | None] = {}
-        self._cost = 0
         self._failed: dict[str, str] = {}
         self._spared: set[str] = set()
-        self._in_vain: dict[str, float] = {}
         self._refused, self._so_far = False, ""
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What could not be tried, and why."""
-        spent = (
-            f"the search was stopped after fits of {self._cost / 10:.0f} s: something further may be in the recording"
-        )
+        spent = f"the search was stopped after {len(self._trials)} fits: something further may be in the recording"
         return (*self._failed.values(), *((spent,) if self._refused else ()))
 
     def so_far(self, model: EchoModel) -> None:
@@ -137,7 +129,7 @@ class Workbench:
         """The score of a model, worked out once."""
         key = signature(model)
         if key not in self._scores:
-            self._scores[key] = self.scorer.of(model)
+            self._scores[key] = self.recording.of(model)
         return self._scores[key]
 
     def off_db(self, model: EchoModel) -> float:
@@ -148,21 +140,22 @@ class Workbench:
         """
         score = self.score(model)
         told = score.active_db - float(np.clip(score.silent_db, -0.5, 0.5))
-        return max(told, abs(self.scorer.silent_db(score)) - STEADY_DB)
+        return max(told, abs(self.recording.silences_db(score)) - STEADY_DB)
 
     def explained(self, model: EchoModel) -> bool:
         """Whether a model leaves so little while the robot is heard that nothing further can be told in it."""
         return self.off_db(model) <= self.criteria.heard_db
 
-    def little(self, model: EchoModel, start: EchoModel) -> bool:
-        """Whether a model leaves so little of what start leaves that the right effects may be in it."""
-        share = _over_fan(self.score(model).active_db) / max(_over_fan(self.score(start).active_db), 1e-12)
+    def little(self, model: EchoModel) -> bool:
+        """Whether a model leaves so little of what the profile leaves that the right effects may be in it."""
+        left, whole = (_over_fan(self.score(each).active_db) for each in (model, self.recording.model))
+        share = left / max(whole, 1e-12)
         return self.off_db(model) <= self.criteria.little_db and share <= self.criteria.nothing
 
     def left(self, model: EchoModel) -> float:
-        """Level in dB over that of the silences."""
+        """Level in dB over that of the silences, with what noise costs that no waveform predicts."""
         score = self.score(model)
-        return max(score.over_db - score.floor_db, 0.0)
+        return max((score.level_db if noisy(model) else score.over_db) - score.floor_db, 0.0)
 
     def attempt(self, name: str, model: EchoModel) -> Trial | None:
         """The effect of that name fitted beside what the model has.
@@ -175,11 +168,10 @@ class Workbench:
             return None
         key = signature(model), name
         if key not in self._trials:
-            if self._cost >= self.criteria.most_cost:
+            if len(self._trials) >= self.criteria.most_fits:
                 self._refused = True
                 return None
             self._trials[key] = self._alike[frozenset(dict(model.effects)), name] = self._attempt(name, model)
-            self._cost += find(name).cost
         return self._trials[key]
 
     def _in_reach(self, name: str, model: EchoModel) -> bool:
@@ -187,17 +179,12 @@ class Workbench:
         most = max(self.left(model), abs(self.score(model).over_db))
         return p_value(name, most) <= self.criteria.false_rate
 
-    def attempt_alike(self, name: str, model: EchoModel) -> Trial | None:
-        """Return attempt(), or what came of it beside the same effects at other values: enough to choose what is worth a closer look."""
-        key = frozenset(dict(model.effects)), name
-        return self._alike[key] if key in self._alike else self.attempt(name, model)
-
     def _attempt(self, name: str, model: EchoModel) -> Trial | None:
         if self._progress:
             self._progress(f"trying {name}{self._so_far}")
         effect, others = find(name), model.without_effect(name)
         try:
-            values = others.fitted(name, self.scorer.behind(others).measurement)
+            values = others.fitted(name, self.recording.behind(others).measurement)
         except (UsageError, ArithmeticError, np.linalg.LinAlgError) as error:
             self._failed[name] = f"{name} could not be fitted and was left out: {error}"
             return None
@@ -225,21 +212,14 @@ class Workbench:
     def attempt_all(self, model: EchoModel, most: int = 9) -> list[Trial]:
         """Each effect that the model has not and whose complexity is at most `most`.
 
-        The last resorts only where none of the others explains a good part of what is left, and not where they were not to be
-        named in less.
+        The last resorts only where none of the others explains a good part of what is left.
         """
-        left, absent = self.left(model), self.absent(model, most)
+        absent = self.absent(model, most)
         found = self._attempt_in_turn([name for name in absent if not find(name).last_resort], model)
-        resorts = [name for name in absent if find(name).last_resort and left < self._in_vain.get(name, np.inf)]
-        enough = self.criteria.part * left
-        if not resorts or self.little(model, self.prepared.model):
+        if self.little(model) or any(self.worth(trial, model) for trial in found):
             return found
-        if any((t.gain_db > enough or self.halves(t, model)) and self.admissible(t, model) for t in found):
-            return found
-        tried = {name: self.attempt(name, model) for name in resorts}
-        vain = [name for name, trial in tried.items() if trial is None or not self.admissible(trial, model)]
-        self._in_vain |= dict.fromkeys(vain, left)
-        return found + [trial for trial in tried.values() if trial is not None]
+        resorts = (self.attempt(name, model) for name in absent if find(name).last_resort)
+        return found + [trial for trial in resorts if trial is not None]
 
     def _attempt_in_turn(self, names: list[str], model: EchoModel) -> list[Trial]:
         """The simple ones first; the richer ones where none of those explains so much that no other could be preferred to it."""
@@ -255,20 +235,16 @@ class Workbench:
     def _settles(self, trial: Trial, model: EchoModel) -> bool:
         """Whether a trial on a model can be named and leaves next to nothing."""
         little = self.left(trial.model) <= self.criteria.nothing * self.left(model)
-        return little and self.explained(trial.model) and self.admissible(trial, model)
+        return little and self.explained(trial.model) and self.admissible(trial)
 
-    def admissible(self, trial: Trial, model: EchoModel) -> bool:
-        """Whether a trial on a model explains enough to be named, and its values look like that effect."""
-        return not self.short_of(trial, model)
+    def worth(self, trial: Trial, model: EchoModel) -> bool:
+        """Whether a trial on a model can be named and explains a good part of what that leaves."""
+        much = trial.gain_db >= self.criteria.part * self.left(model) or self.halves(trial, model)
+        return much and self.admissible(trial)
 
-    def short_of(self, trial: Trial, model: EchoModel) -> str:
-        """The bar that a trial on a model does not reach, in words; empty where it is admissible."""
-        if trial.p_value > self.criteria.false_rate:
-            return f"{percent(trial.p_value)} of ordinary recordings show as much of some effect"
-        if trial.name in dict(self._start.effects):  # known to be there: it may be weaker now, or gone
-            return ""
-        evidence = Evidence(trial.values, model, self.scorer, self.score(model), trial.score)
-        return "" if find(trial.name).plausible(evidence) else "its values do not look like it"
+    def admissible(self, trial: Trial) -> bool:
+        """Whether a trial explains enough to be named."""
+        return trial.p_value <= self.criteria.false_rate
 
     def tried(self, start: EchoModel, model: EchoModel) -> tuple[Tried, ...]:
         """All effects that were fitted, beside the start or elsewhere, with what came of them, and those that were spared; nothing is fitted anew."""
@@ -277,8 +253,7 @@ class Workbench:
         for name in names_tried:
             alone = self._trials.get((signature(start), name))
             others = frozenset(dict(self.less(model, name).effects))
-            short = self.short_of(alone, start) if alone else ""
-            found.append(Tried(name, alone, self._alike.get((others, name)), short, self._failed.get(name, "")))
+            found.append(Tried(name, alone, self._alike.get((others, name)), self._failed.get(name, "")))
         spared = [name for name in names() if name in self._spared and name not in names_tried]
         return (*found, *(Tried(name, None, None, spared=True) for name in spared))
 
@@ -308,6 +283,11 @@ def added(start: EchoModel, model: EchoModel) -> list[str]:
     """Names of the effects that a model has beyond the start it was made from, or at other values, the latest last."""
     known = dict(start.effects)
     return [name for name, values in model.effects if known.get(name) is not values]
+
+
+def noisy(model: EchoModel) -> bool:
+    """Whether a model expects noise that no waveform predicts: that fits whatever is left."""
+    return any(find(name).adds_noise for name, _ in model.effects)
 
 
 def less(start: EchoModel, model: EchoModel, name: str) -> EchoModel:

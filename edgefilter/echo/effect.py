@@ -7,7 +7,6 @@ from typing import ClassVar, Literal, Protocol, TypeAlias, get_args
 
 import numpy as np
 
-from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.errors import UsageError
 from edgefilter.types import Array, Samples
@@ -74,10 +73,9 @@ class Effect:
     What the diagnosis asks:
     title: how it reads inside a sentence ("a turned volume"); by default the name. complexity: of two effects that
     explain about as much the lower one is named; from 4 on it is a long filter, which half a minute does not teach.
-    cost: of a fit, in tenths of a second. flexible: whether it has so many numbers that it takes up what a simpler effect
-    beside it does. free: whether it is the law of a family
-    rather than an effect (free_laws.py): no search tries it. shown_by: recordings in which it differs from effects without
-    them (diagnosis/advice.py).
+    flexible: whether it has so many numbers that it takes up what a simpler effect beside it does. free: whether it is the
+    law of a family rather than an effect (free_laws.py): no search tries it. shown_by: recordings in which it differs from
+    effects without them (diagnosis/advice.py).
     """
 
     name: ClassVar[str]
@@ -92,7 +90,6 @@ class Effect:
     family: ClassVar[Family] = "of your own"
     title: ClassVar[str] = ""
     complexity: ClassVar[int] = 3
-    cost: ClassVar[int] = 1
     flexible: ClassVar[bool] = False
     free: ClassVar[bool] = False
     shown_by: ClassVar[tuple[Experiment, ...]] = ()
@@ -110,7 +107,7 @@ class Effect:
         return None
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """Values with which the model, this effect added, comes closest to the recording; by default the neutral ones."""
+        """Values with which the model, this effect added, comes closest to the recording; the neutral ones where it shows no sign of it."""
         return neutral(self)
 
     def noise_psd(self, values: Values, psd: Samples) -> Samples:
@@ -132,17 +129,9 @@ class Effect:
         """What a gain by level behind the microphone lets through of the fan's sound (n,) beside a voice (n,); by default all of it."""
         return noise
 
-    def settled(self, values: Values) -> Values:
-        """Values with which the effect is from the start what it is at a recording's end: what the running filter begins with."""
-        return values
-
     def sentence(self, values: Values) -> str:
         """What in a recording speaks for the effect, with figures; empty: nothing but that the residual falls."""
         return ""
-
-    def plausible(self, evidence: Evidence) -> bool:
-        """Whether the values, and what they explain, look like this effect rather than another."""
-        return True
 
     def only(self, values: Values) -> Values:
         """Values without what a flexible fit has taken up of another effect; by default as they are."""

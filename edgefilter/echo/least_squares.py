@@ -69,6 +69,20 @@ def normal_equations(
     return Normal(matrix, right, energy, taps)
 
 
+def hats(x: Array, knots: Array, beyond: bool = False) -> Array:
+    """Parts whose sum by heights at the knots (k,) is the curve through these at x (n,), (k, n) float32.
+
+    beyond: whether it goes on as it ends outside of the knots, rather than level.
+    """
+    left = np.clip(np.searchsorted(knots, x) - 1, 0, knots.size - 2)
+    share = ((x - knots[left]) / (knots[left + 1] - knots[left])).astype(np.float32)
+    share = share if beyond else np.clip(share, 0.0, 1.0)
+    parts = np.zeros((knots.size, x.size), np.float32)
+    at = np.arange(x.size)
+    parts[left, at], parts[left + 1, at] = 1.0 - share, share
+    return parts
+
+
 def filtered(x: Samples, taps: Array, lead: int = 0) -> Samples:
     """The signal x (n,) through taps (t,), tap k a delay of k - lead samples, (n,) float32."""
     taps = taps.astype(np.float32)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol, TypeAlias, TypeVar
@@ -43,6 +43,9 @@ class VoiceModel(Protocol):
 
     def predict(self, reference: Samples) -> Samples:
         """The robot's voice at the microphone (n,) for an aligned reference (n,)."""
+
+    def unpredictable(self, reference: Samples) -> Sequence[tuple[Samples, Array]]:
+        """Of each source of the noise that effects add: its expected square (n,), and its density (601,) per Hz."""
 
     def response(self) -> Samples:
         """The linear path with the effects that change it, (taps,)."""

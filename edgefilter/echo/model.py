@@ -94,9 +94,7 @@ class EchoModel:
 
     def running_response(self) -> Samples:
         """The path with the effects on it that are filters, as after the last change, (taps,): what the running filter starts from."""
-        linear = [
-            (effect, effect.settled(values)) for effect, values in chain(self.effects) if is_filter(effect, values)
-        ]
+        linear = [(effect, values) for effect, values in chain(self.effects) if is_filter(effect, values)]
         return self._response_with(linear, 1e-4)
 
     def with_running_response(self, response: Samples, gain: float = 1.0) -> EchoModel:

@@ -141,10 +141,9 @@ def reach(effect: Effect, values: Values) -> str:
 
 
 def is_filter(effect: Effect, values: Values) -> bool:
-    """Whether an effect, as it is at a recording's end, belongs to the path: of stage "path" where a trial finds it linear and always the same."""
+    """Whether an effect belongs to the path: of stage "path" where a trial finds it linear and always the same."""
     if effect.stage != "path":
         return effect.stage == "response"
-    values = effect.settled(values)
     a, b = (_probe(seed) for seed in (0, 1))
     one, other = (effect.apply(x, values, SAMPLE_RATE) for x in (a, b))
     if not _same(effect.apply(a + 2.0 * b, values, SAMPLE_RATE), one + 2.0 * other):

@@ -16,7 +16,7 @@ from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 SETTLED = 1e-6
 """A step that explains less than this part of what all before it have explained is the last."""
-DELAYS = np.arange(-8.0, 8.01, 0.1)
+DELAYS = np.arange(-80.0, 81.0) / 10.0
 """Samples by which the lag of a filtered recording may be off: it is found as that of the loudest frequencies."""
 LONGEST = 12800
 """Taps of the longest filter that is fitted, 0.8 s: the decay by 60 dB of an office, by 40 dB of a hall."""

@@ -8,29 +8,20 @@ from scipy import signal
 
 from edgefilter.diagnosis.diagnose import diagnose, settle
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.score import Scorer
-from edgefilter.echo.effect import complete
+from edgefilter.diagnosis.recording import Recording
+from edgefilter.echo.effect import complete, vanishes
 from edgefilter.echo.effects.catalogue import find
-from edgefilter.echo.effects.codec_signs import signs_of
-from edgefilter.echo.evidence import Evidence
+from edgefilter.echo.measurement import Values
 from tests.diagnosis.robot_scene import profile, record, voice
 from tests.diagnosis.test_packet_loss import coded, lossy
 
 SECONDS = 8.0
 
 
-def evidence(recording: np.ndarray, x: np.ndarray) -> Evidence:
+def fitted(recording: np.ndarray, x: np.ndarray) -> tuple[Recording, Values]:
     """The codec fitted to a recording beside nothing else."""
     prepared = prepare(profile(), recording, x)
-    scorer, codec = Scorer(prepared), find("codec")
-    values = codec.fit(prepared.measurement, prepared.model)
-    return Evidence(
-        values,
-        prepared.model,
-        scorer,
-        scorer.of(prepared.model),
-        scorer.of(prepared.model.with_effect("codec", values)),
-    )
+    return prepared, prepared.model.fitted("codec", prepared.measurement)
 
 
 def trembling(x: np.ndarray) -> np.ndarray:
@@ -91,13 +82,13 @@ def test_the_noise_in_a_band_follows_the_voice_in_that_band() -> None:
 )
 def test_what_is_left_of_something_else_is_no_codec(change) -> None:
     x = voice(SECONDS)
-    found = evidence(change(x), x)
-    assert not find("codec").plausible(found), signs_of(found)
+    _, values = fitted(change(x), x)
+    assert vanishes(find("codec"), values)
 
 
 def test_the_score_counts_the_noise_as_expected() -> None:
     x = voice(SECONDS)
-    found = evidence(record(coded(x, -8.0)), x)
-    assert find("codec").plausible(found), signs_of(found)
-    assert found.after.excess_db < 0.4 * found.before.excess_db and found.after.silent_db < 0.5
-    assert found.after.irreducible_db > 2.0
+    prepared, values = fitted(record(coded(x, -8.0)), x)
+    before, after = (prepared.of(model) for model in (prepared.model, prepared.model.with_effect("codec", values)))
+    assert after.excess_db < 0.4 * before.excess_db and prepared.silences_db(after) < 0.5
+    assert after.irreducible_db > 2.0

@@ -17,7 +17,7 @@ from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import add, diagnose
 from edgefilter.diagnosis.findings import findings_of
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.score import Scorer
+from edgefilter.diagnosis.recording import bands
 from edgefilter.diagnosis.trials import Found, Workbench
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.effect import Effect, Parameter
@@ -91,10 +91,8 @@ def test_the_words_name_a_band_of_the_scorer() -> None:
     ring = tone * np.sin(2 * np.pi * 170 * np.arange(x.size) / RATE)
     recording = (clean + 0.5 * ring + FAN * np.random.default_rng(3).standard_normal(x.size)).astype(np.float32)
     found = diagnose(profile(), recording, x)
-    bands = {
-        f"strongest around {low:.0f} to {high:.0f} Hz" for low, high in Scorer(prepare(profile(), recording, x)).band_hz
-    }
-    assert found.verdict == "unexplained" and any(band in found.evidence for band in bands), found.evidence
+    places = {f"strongest around {low:.0f} to {high:.0f} Hz" for low, high in bands().hz}
+    assert found.verdict == "unexplained" and any(place in found.evidence for place in places), found.evidence
 
 
 class Fragile(Effect):
@@ -167,7 +165,7 @@ def test_a_search_that_is_cut_short_says_so() -> None:
             x, EchoModel(path()).with_effect("late_reverb", {"taps": np.r_[np.zeros(900), 0.3, np.zeros(300), 0.2]})
         ),
         x,
-        criteria=Criteria(most_cost=3),
+        criteria=Criteria(most_fits=3),
     )
     assert any("search was stopped after" in text for text in found.comparison.warnings)
     assert found.verdict in ("missing", "unexplained")

@@ -13,13 +13,12 @@ from edgefilter.diagnosis.compare import compare
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import Diagnosis, add, conclude, diagnose, holds
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.score import Scorer
+from edgefilter.diagnosis.recording import Score, bands
 from edgefilter.diagnosis.select import search
 from edgefilter.diagnosis.trials import Found, Trial, Workbench
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.effects.bandlimit import band_edge
 from edgefilter.echo.effects.catalogue import find
-from edgefilter.echo.evidence import Score
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.wiener import spectra
 from edgefilter.types import PRE_ROLL
@@ -203,7 +202,7 @@ def test_the_dictionary_has_the_published_keys_and_is_json() -> None:
 @pytest.mark.parametrize(("excess_db", "told"), [(0.75, "explained"), (0.85, "unexplained")])
 def test_where_nothing_is_named_up_to_eight_tenths_of_a_decibel_are_left_by_the_fan_of_another_day(excess_db, told):
     prepared = prepare(profile(), record(voice(4.0)), voice(4.0))
-    score = replace(Scorer(prepared).of(prepared.model), excess_db=excess_db)
+    score = replace(prepared.of(prepared.model), excess_db=excess_db)
     found = conclude(prepared, Found(prepared, prepared.model, prepared.model, score, score, ()), Criteria())
     assert (found.verdict, found.ranking) == (told, ())
 
@@ -233,9 +232,9 @@ def test_an_effect_of_few_numbers_is_chosen_where_it_explains_more_than_by_chanc
 
 def test_what_ordinary_recordings_show_more_of_than_is_left_is_not_fitted():
     bench = Workbench(prepare(profile(), record(voice(4.0)), voice(4.0)), Criteria())
-    left = replace(verdict(0.3, 0.3), cells=np.ones((bench.scorer.starts.size, bench.scorer.freedom.size)))
+    left = replace(verdict(0.3, 0.3), cells=np.ones((bench.recording.starts.size, bands().freedom.size)))
     bench.score = lambda asked: left  # an ordinary loudspeaker's distortion explains twice as much
-    model = bench.prepared.model
+    model = bench.recording.model
     assert bench.attempt("speaker_nonlinearity", model) is None
     (row,) = bench.tried(model, model)
     assert (row.name, row.spared, row.alone) == ("speaker_nonlinearity", True, None)

@@ -9,7 +9,7 @@ from edgefilter.alignment.belief import believe
 from edgefilter.diagnosis.precision import precision
 from edgefilter.diagnosis.prepare import utterance_lags
 from edgefilter.diagnosis.probe import Inquiry
-from edgefilter.diagnosis.score import share_of
+from edgefilter.diagnosis.recording import share_of
 from edgefilter.echo.effects.catalogue import register
 from edgefilter.echo.effects.playback_gain import PlaybackGain
 from edgefilter.echo.model import EchoModel

@@ -60,5 +60,5 @@ def test_what_holds_the_voice_down_is_told_from_its_rivals(device, expected: str
     prepared = prepare(profile(), record(device(x.astype(float)).astype(np.float32)), x)
     bench = Workbench(prepared, Criteria())
     trials = [trial for name in RIVALS if (trial := bench.attempt(name, prepared.model)) is not None]
-    chosen = bench.preferred(trial for trial in trials if bench.admissible(trial, prepared.model))
+    chosen = bench.preferred(trial for trial in trials if bench.admissible(trial))
     assert chosen is not None and chosen.name == expected, [(t.name, round(t.gain_db, 2)) for t in trials]

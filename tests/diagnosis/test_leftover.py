@@ -16,7 +16,7 @@ SECONDS = 12
 
 
 def words(left: Leftover, human=(), active_db: float = 0.0, remaining_db: float = 3.0) -> str:
-    found = SimpleNamespace(prepared=SimpleNamespace(human=human), final=SimpleNamespace(active_db=active_db))
+    found = SimpleNamespace(recording=SimpleNamespace(human=human), final=SimpleNamespace(active_db=active_db))
     return left_in_words(found, left, remaining_db, floor_db=2.0)
 
 

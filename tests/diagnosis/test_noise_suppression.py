@@ -10,7 +10,6 @@ import pytest
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import add, diagnose
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.score import Scorer
 from edgefilter.diagnosis.select import search
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
@@ -76,7 +75,7 @@ def _softer(factor: float) -> Callable[[np.ndarray], np.ndarray]:
 def test_what_is_soft_without_a_suppressor_is_not_called_one(change, silence_db: float) -> None:
     x = voice(SECONDS)
     prepared = prepare(profile(), change(x), x)
-    base = Scorer(prepared).of(prepared.model)
+    base = prepared.of(prepared.model)
     assert base.silent_db == pytest.approx(silence_db, abs=0.7)
     assert "noise_suppression" not in [step.name for step in search(prepared, prepared.model, Criteria()).steps]
 
@@ -106,7 +105,7 @@ def test_what_the_running_filter_contradicts_is_not_looked_for() -> None:
 def test_it_stays_named_beside_what_nothing_explains() -> None:
     x = voice(SECONDS)
     trembling = 0.7 + 0.3 * np.sin(2 * np.pi * 7.0 * np.arange(x.size) / 16000)
-    quick = Criteria(most_effects=2, starts=0)
+    quick = Criteria(most_effects=2)
     found = diagnose(profile(), suppressed(record((trembling * x).astype(np.float32)), -12.0), x, criteria=quick)
     assert found.verdict == "unexplained" and [f.effect for f in found.ranking][:1] == ["noise_suppression"]
     row = next(row for row in found.tried if row.effect == "noise_suppression")

@@ -100,7 +100,7 @@ def test_what_is_missing_without_packets_is_not_called_so(change) -> None:
     prepared = prepare(profile(), change(x), x)
     bench = Workbench(prepared, Criteria())
     trial = bench.attempt("packet_loss", prepared.model)
-    assert trial is None or not bench.admissible(trial, prepared.model)
+    assert trial is None or not bench.admissible(trial)
 
 
 @pytest.mark.slow
@@ -111,5 +111,5 @@ def test_the_fan_stays_in_a_lost_frame() -> None:
         prepared = prepare(profile(), heard, x)
         bench = Workbench(prepared, Criteria())
         trial = bench.attempt("packet_loss", prepared.model)
-        assert (trial is not None and bench.admissible(trial, prepared.model)) is expected
+        assert (trial is not None and bench.admissible(trial)) is expected
     assert float(np.std(record(0.0 * x))) == pytest.approx(FAN, rel=0.01)

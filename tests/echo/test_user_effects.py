@@ -167,14 +167,11 @@ def test_a_noise_hook_that_fails_is_one_line(write, hook, words):
 
 
 def test_what_a_users_class_says_of_itself_is_kept(write):
-    told = (
-        "    memory, flexible, complexity, title = 0, True, 1, 'a tilt'\n\n    def settled(self, values):\n       "
-        " return {**values, 'amount': 0.25}\n"
-    )
+    told = "    memory, flexible, complexity, title = 0, True, 1, 'a tilt'\n"
     load_effect(write(GOOD.replace("    def apply", told + "\n    def apply")))
     tilt = find("tilt")
-    assert (tilt.memory, tilt.flexible, tilt.complexity, tilt.title, tilt.cost) == (0, True, 1, "a tilt", 1)
-    assert tilt.settled({"amount": 1.0}) == {"amount": 0.25} and tilt.sentence({"amount": 1.0}) == ""
+    assert (tilt.memory, tilt.flexible, tilt.complexity, tilt.title) == (0, True, 1, "a tilt")
+    assert tilt.sentence({"amount": 1.0}) == ""
 
 
 @pytest.mark.parametrize(

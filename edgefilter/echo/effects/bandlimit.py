@@ -10,11 +10,13 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
+from scipy.ndimage import uniform_filter1d
 
 from edgefilter.dsp.fourier import power
-from edgefilter.echo.effect import Effect, Parameter, first, numbers
-from edgefilter.echo.evidence import Evidence
-from edgefilter.echo.measurement import Measurement, Values, VoiceModel
+from edgefilter.dsp.frames import decibels
+from edgefilter.echo.effect import Effect, Parameter, complete, first, neutral, numbers
+from edgefilter.echo.effects.knock_power import BAND_HZ, BANDS, band_power, frames_to_fit
+from edgefilter.echo.measurement import Measurement, Values, VoiceModel, level_ratio
 from edgefilter.echo.wiener import DELAYS, Spectra, convolve_from, fit_filter, spectra
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
@@ -33,14 +35,15 @@ LEAST_ORDER, BY_LAW = 2.0, 0.77
 does .81 to .99 of what both do, of .73 at most where another equaliser looks like one (10 band limits, 8 equalisers)."""
 PASSED_HZ, FLAT_DB = 300.0, 0.3
 """From where on a band limit passes the voice, and the standard deviation of a gain over frequency that is one gain."""
-LOUD, FEW, NOT_CUT = 3.0, 20, 0.05
-"""Cells count above a cut-off where the voice was due by this factor over the fan, fewer of them tell nothing, and this part of it
+LOUD, NOT_CUT = 3.0, 0.05
+"""Cells count above a cut-off where the voice was due by this factor over the fan, and this part of it
 is still there in the median one: 0.00 behind 15 band limits, rattles beside them or not, 0.1 to 0.4 behind 8 codecs."""
 STEEP = 16.0
 """Order of a cut that shows in the power alone."""
-GONE, KEPT = 0.25, 0.5
-"""Parts of the predicted power above a cut-off: no more than the first is there where the power alone shows the cut, less than the
-second where the waveform does."""
+GONE = 0.25
+"""Part of the predicted power above a cut-off that is there at most where the power alone shows the cut."""
+SMOOTH = 32
+"""Frames of a cell, 128 ms."""
 SURE = 4.0
 """And what is missing is so many standard deviations: by chance at one edge in thirty thousand."""
 PASSED = (0.8, 1.2)
@@ -84,8 +87,9 @@ class Bandlimit(Effect):
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """The best of a grid of cut-offs, orders and phases, refined, each at its best delay and gain, in the whitened cross-spectrum. Then taps.
 
-        Where the power does not end there, what is common with the reference is hidden by something else, such as a codec's
-        noise: then the cut-off is where the power ends.
+        Where more is heard above, what is common with the reference is hidden by something else, such as a codec's noise:
+        then the cut-off is where the power ends. Neutral where it is no low-pass but a colouring: not steep, by its
+        taps rather than by its law, or with something above it that no filter passes.
         """
         predicted, x = measurement.predicted(model)
         found = spectra(measurement, x, 20.0)
@@ -111,31 +115,28 @@ class Bandlimit(Effect):
             )
             best, late = best_of(near, np.stack([low_pass(found.hz, *values) for values in near]))
             step = 1.0 + (step - 1.0) * 0.6
-        if not _ends_at(found, best[0]) and (edge := band_edge(found)) is not None:
-            return {"cutoff_hz": edge, "order": STEEP}
-        values = {
-            "cutoff_hz": float(np.clip(best[0], 200.0, 15999.0)),
-            "order": float(best[1]),
-            "phase": float(best[2]),
-            "delay": late,
-        }
-        left = measurement.white_recording - self.apply(x, {**values, "taps": 0.0}, SAMPLE_RATE)
-        taps = fit_filter(x, left, measurement.weights, TAPS, LEAD, prior=np.full(TAPS, 1e-3), steps=15)
-        return {**values, "taps": np.clip(taps, -10.0, 10.0)}
+        values: Values = {"cutoff_hz": best[0], "order": best[1], "phase": best[2], "delay": late}
+        heard, plain = measurement.white_recording, self.apply(x, {**values, "taps": 0.0}, SAMPLE_RATE)
+        taps = fit_filter(x, heard - plain, measurement.weights, TAPS, LEAD, prior=np.full(TAPS, 1e-3), steps=15)
+        passed = plain + convolve_from(x, taps, LEAD)
+        values = {**values, "taps": np.clip(taps, -10.0, 10.0)}
+        noisy = bool(model.unpredictable(measurement.reference))  # then what is heard there may be that
+        if not noisy and not _dull_above(best[0], measurement, x, passed):
+            if (edge := band_edge(found)) is None:
+                return neutral(self)
+            values = complete(self, {"cutoff_hz": edge, "order": STEEP})
+            dull = edge < HIGHEST_HZ and _dull_above(edge, measurement, x, self.apply(x, values, SAMPLE_RATE))
+            return values if dull else neutral(self)
+        gain = np.float32(level_ratio(heard, plain * measurement.weights))
+        before, by_law, whole = (_level_db(measurement, heard - voice) for voice in (x, gain * plain, passed))
+        steep = best[0] < HIGHEST_HZ and best[1] >= LEAST_ORDER and before - by_law > BY_LAW * (before - whole)
+        return values if steep else neutral(self)
 
     def sentence(self, values: Values) -> str:
         """From where on there is nothing."""
         return (
             f"what the recording has in common with the reference falls off above {first(values, 'cutoff_hz'):.0f} Hz"
         )
-
-    def plausible(self, evidence: Evidence) -> bool:
-        """A low-pass and not a colouring: steep, by its law rather than by the taps, and little is heard above it."""
-        values, cutoff = evidence.values, float(evidence.values["cutoff_hz"])
-        if cutoff >= HIGHEST_HZ or float(values["order"]) < LEAST_ORDER or not _dull_above(cutoff, evidence):
-            return False
-        plain = self.apply(evidence.before.prediction, {**values, "taps": 0.0}, SAMPLE_RATE)
-        return evidence.share(plain) > BY_LAW
 
     def only(self, values: Values) -> Values:
         """The band that is passed as it was, where one gain is all that happens to it."""
@@ -167,23 +168,23 @@ def band_edge(found: Spectra) -> float | None:
     return edge if missing and PASSED[0] <= passed <= PASSED[1] else None
 
 
-def _ends_at(found: Spectra, cutoff_hz: float) -> bool:
-    """Whether the recording's power falls above a cut-off, where some was predicted."""
-    above = (found.hz > 1.1 * cutoff_hz) & (found.predicted > found.fan)
-    return bool(np.sum(found.heard[above] - found.fan) <= KEPT * np.sum(found.predicted[above]))
+def _level_db(measurement: Measurement, residual: Samples) -> float:
+    """Mean level of a whitened residual (n,) in cells of time and frequency, over the samples to fit on: many count, not the loudest."""
+    cells = uniform_filter1d(band_power(residual), SMOOTH, axis=0)
+    return float(np.mean(decibels(0.5 + 0.5 * cells[frames_to_fit(measurement.fit, len(cells))])))
 
 
-def _dull_above(cutoff_hz: float, evidence: Evidence) -> bool:
-    """Whether nothing but what the filter passes is heard above the cut-off: a codec puts its noise there.
+def _dull_above(cutoff_hz: float, measurement: Measurement, voice: Samples, passed: Samples) -> bool:
+    """Whether nothing but what is passed (n,) of a voice (n,), whitened, is heard above the cut-off: a codec puts its noise there.
 
-    In the median of cells, since knocks are in few of them; noise that the model expects is no voice.
+    In the median of cells, since knocks are in few of them.
     """
-    grid, before = evidence.grid, evidence.before
-    above = np.ix_(grid.active_cells, grid.band_hz[:, 0] > 1.1 * cutoff_hz)
-    over = grid.cells(grid.measurement.recording) - evidence.noise - grid.cells(evidence.after.prediction)
-    due = grid.cells(before.prediction)[above]
-    loud = due > LOUD
-    return bool(loud.sum() < FEW or np.median(over[above][loud] / due[loud]) < NOT_CUT)
+    above = np.arange(BANDS) * BAND_HZ > 1.1 * cutoff_hz
+    heard, due, kept = (
+        uniform_filter1d(band_power(x)[:, above], SMOOTH, axis=0) for x in (measurement.white_recording, voice, passed)
+    )
+    loud = (due > LOUD) & frames_to_fit(measurement.fit, len(due))[:, None]
+    return bool(not loud.any() or np.median(((heard - 1.0 - kept) / np.maximum(due, LOUD))[loud]) < NOT_CUT)
 
 
 @lru_cache(maxsize=2)

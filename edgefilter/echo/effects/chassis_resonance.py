@@ -9,8 +9,7 @@ import scipy
 from numpy.typing import NDArray
 
 from edgefilter.dsp.lag import turn
-from edgefilter.echo.effect import Effect, Parameter, numbers, within
-from edgefilter.echo.evidence import Evidence
+from edgefilter.echo.effect import Effect, Parameter, neutral, numbers, within
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import Spectra, spectra
 from edgefilter.types import SAMPLE_RATE, Array, Samples
@@ -53,7 +52,10 @@ class ChassisResonance(Effect):
         return y
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """Frequency and Q by a search in the whitened cross-spectrum, gain and phase by least squares; if it pays, another mode."""
+        """Frequency and Q by a search in the whitened cross-spectrum, gain and phase by least squares; if it pays, another mode.
+
+        Neutral where what is found is too broad for a mode, or cut off by the search's bounds.
+        """
         predicted, white = measurement.predicted(model)
         coarse, fine = (spectra(measurement, white, resolution_hz) for resolution_hz in (1.0, 0.1))
         residual = measurement.white_recording - white
@@ -62,7 +64,7 @@ class ChassisResonance(Effect):
         for _ in range(MODES):
             frequency, q = _search(_without(coarse, modes, gains))
             mode = _refine(_without(coarse if frequency / q > BROAD_HZ else fine, modes, gains), frequency, q)
-            if modes and mode[1] < LEAST_Q:
+            if mode[1] < LEAST_Q or not LOWEST_HZ < mode[0] < HIGHEST_HZ:
                 break
             ring = _ring(predicted, *mode, SAMPLE_RATE)
             added = [measurement.whiten(part.astype(np.float32)) for part in (ring.real, -ring.imag)]
@@ -72,6 +74,8 @@ class ChassisResonance(Effect):
             if modes and float(solved @ right) < (1.0 + NEXT) * explained:
                 break
             modes, columns, gains, explained = [*modes, mode], tried, solved, float(solved @ right)
+        if not modes:
+            return neutral(self)
         complex_gains = gains[::2] + 1j * gains[1::2]
         level = 20.0 * np.log10(np.maximum(np.abs(complex_gains), 1e-6))
         found = np.array([*zip(*modes, strict=True), level, np.rad2deg(np.angle(complex_gains))])[:, np.argsort(-level)]
@@ -83,11 +87,6 @@ class ChassisResonance(Effect):
         modes = [f"{hz:.0f} Hz with Q {q:.0f}" for hz, q in both]
         where = "one frequency" if len(modes) == 1 else "two frequencies"
         return f"the residual rings at {where}, {' and '.join(modes)}, whenever the voice excites it"
-
-    def plausible(self, evidence: Evidence) -> bool:
-        """Sharp enough for a mode, and none that the search's bounds have cut off."""
-        q, hz = (numbers(evidence.values, name) for name in ("q", "frequency_hz"))
-        return bool(np.all(q >= LEAST_Q) and np.all((hz > LOWEST_HZ) & (hz < HIGHEST_HZ)))
 
 
 def _without(found: Spectra, modes: list[tuple[float, float]], gains: Array) -> Spectra:

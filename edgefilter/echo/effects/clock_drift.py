@@ -7,7 +7,6 @@ import scipy
 
 from edgefilter.dsp.fractional_delay import interpolate
 from edgefilter.echo.effect import Effect, Parameter, first, neutral, within
-from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.lag_track import track_lag
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import Array, Samples
@@ -16,8 +15,9 @@ PASSES = ((4000, 512), (8000, 16))
 """Samples of a block and of lag either way: short blocks while the drift smears them, longer ones once it is taken out."""
 STEADY = 0.05
 """Samples by which a block's lag may err for other reasons than noise."""
-LEAST_PPM = 0.5
-"""Least difference of two clocks, in 1e-6: what tests/echo/effects/test_timing.py lets a fit err by beside faint distortion."""
+LEAST = 0.5
+"""Least difference of two clocks, in 1e-6, or lag at the start, in samples: what tests/echo/effects/test_timing.py lets a fit err by
+beside faint distortion."""
 
 
 class ClockDrift(Effect):
@@ -48,7 +48,7 @@ class ClockDrift(Effect):
         return interpolate(x, n - offset + 1e-6 * ppm * n) if ppm or offset else x.copy()
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """A robust line through the lags of all blocks, then once more on the prediction that it has straightened."""
+        """A robust line through the lags of all blocks, then once more on the prediction that it has straightened; neutral for one clock."""
         predicted, recording = measurement.predicted(model)[0], measurement.white_recording
         n = np.arange(predicted.size)
         lag: Array = np.zeros(predicted.size)
@@ -62,14 +62,11 @@ class ClockDrift(Effect):
             lag = offset + slope * n
         if not n.size:
             return neutral(self)
-        return within(self, {"ppm": -1e6 * (lag[-1] - lag[0]) / max(n.size - 1, 1), "offset": lag[0]})
+        ppm = -1e6 * (lag[-1] - lag[0]) / max(n.size - 1, 1)
+        return within(self, {"ppm": ppm, "offset": lag[0]}) if max(abs(ppm), abs(lag[0])) >= LEAST else neutral(self)
 
     def sentence(self, values: Values) -> str:
         return f"the lag grows along a line, by {abs(first(values, 'ppm')):.1f} samples in a million"
-
-    def plausible(self, evidence: Evidence) -> bool:
-        """More than two clocks differ that are one."""
-        return abs(float(evidence.values["ppm"])) >= LEAST_PPM
 
 
 def robust_line(x: Array, y: Array, sigma: Array) -> tuple[float, float]:

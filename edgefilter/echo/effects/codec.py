@@ -9,7 +9,7 @@ import scipy
 
 from edgefilter.dsp.frames import decibels
 from edgefilter.echo.effect import Effect, Parameter, first, neutral, within
-from edgefilter.echo.effects.codec_signs import HEARD, signs_of
+from edgefilter.echo.effects.codec_signs import HEARD, is_codec
 from edgefilter.echo.effects.knock_power import (
     BANDS,
     FRAME,
@@ -20,12 +20,14 @@ from edgefilter.echo.effects.knock_power import (
     fan_in_bands,
     frames_to_fit,
 )
-from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 DECAYS_MS, EXPONENTS = (4.0, 8.0, 16.0, 32.0), (0.5, 0.7, 1.0)
 """Tried, by likelihood: a codec's frames and the room; and how the noise grows with the voice."""
+CLEAR, STANDS_OUT = 30.0, 1.25
+"""Times the fan that the voice must be in a band for its noise to be expected there, and that the residual must be in the median
+one of these bands: what happens in a narrow band alone is no codec's."""
 
 
 class Codec(Effect):
@@ -45,7 +47,6 @@ class Codec(Effect):
     title = "a codec"
     shown_by = ("levels", "tone")
     complexity = 3
-    cost = 4
     followed = True
     parameters = (
         Parameter("power", "full scale^2", 0.0, 0.0, 1e3),
@@ -68,15 +69,18 @@ class Codec(Effect):
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Maximum likelihood of the residual's power in cells, as for a rattle's, for each decay and exponent.
 
-        Neutral where the fan is unknown or nothing is left over it.
+        Neutral where the fan is unknown, nothing is left over it, or what is left does not follow the voice as a codec's noise.
         """
         if measurement.noise_psd is None:
             return neutral(self)
         predicted, target = measurement.predicted(model)[1], measurement.white_recording
+        if not is_codec(measurement, predicted):
+            return neutral(self)
         over, voice = band_power(target - predicted), band_power(predicted)
         use = frames_to_fit(measurement.fit, len(over))
         loud = use & (voice.mean(axis=1) > HEARD)
-        if not loud.any():
+        clear = voice[loud].mean(axis=0) > CLEAR if loud.any() else np.zeros(BANDS, bool)
+        if not clear.any() or np.median(over[loud].mean(axis=0)[clear]) < STANDS_OUT:
             return neutral(self)
         levels = {decay: _levels(measurement.reference, decay) for decay in DECAYS_MS}
         tried = [
@@ -95,10 +99,6 @@ class Codec(Effect):
             f"noise {first(values, 'below_voice_db'):.0f} dB below the voice follows it in every band, but neither its phase nor"
             " its harmonics: what a codec leaves, and no waveform predicts; it is shown as irreducible"
         )
-
-    def plausible(self, evidence: Evidence) -> bool:
-        """What is left follows the voice's level in each band, but not its phase, nor its harmonics."""
-        return signs_of(evidence).of_a_codec
 
 
 def _levels(x: Samples, decay_ms: float) -> Array:

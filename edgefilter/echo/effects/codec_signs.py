@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import scipy
 from numpy.typing import NDArray
@@ -12,9 +10,9 @@ from scipy.ndimage import uniform_filter, uniform_filter1d
 from edgefilter.dsp.fourier import power as power_of
 from edgefilter.dsp.frames import decibels, frames
 from edgefilter.dsp.psd import hann
-from edgefilter.echo.evidence import Evidence
+from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.wiener import convolve_from, fit_filter
-from edgefilter.types import Array, Samples
+from edgefilter.types import Samples
 
 TAPS, LEAD = 256, 64
 """Of the filter by which the path may differ, and a band be cut."""
@@ -30,46 +28,28 @@ HEARD = 2.0
 FOLLOWS = 0.4
 """Correlation, over time in bands, of the residual's level with the voice's: what sounds by itself has none, knocks less than
 0.35."""
-CLEAR, STANDS_OUT, BROAD = 30.0, 1.25, 0.4
-"""Times the fan that the voice must be in a band for its noise to be expected there, that the residual must be to be there,
-and the part of such bands in which it is: what happens in a narrow band alone is no codec's."""
 COHERENT = 0.24
 """Of the residual's power around a cell, what one gain of the voice explains at most: chance is 0.05, codecs are up to 0.22,
 distortions from 0.25 on and all that moves from 0.4 on."""
-PEAKED = 1.26
-"""Spread of the residual's fine structure over frequency re that of noise, at most: a loudspeaker's distortion has the voice's
-harmonics (of 72 pieces of a real one the least is 1.32), a talker his own; nine codecs in ten are below 1.22."""
-AROUND, OF_NOISE = 17, 1.1
-"""Bins of 16 Hz over which that is smoothed, and the standard deviation of the log of a periodogram of noise around it."""
+PEAKED = 1.39
+"""Standard deviation of the log of the residual's fine structure over frequency, at most: 1.1 of noise, of a loudspeaker's
+distortion, which has the voice's harmonics, 1.45 and more (72 pieces of a real one), of nine codecs in ten below 1.34."""
+AROUND = 17
+"""Bins of 16 Hz over which that is smoothed."""
 
 
-@dataclass(frozen=True)
-class Signs:
-    """Of a whitened residual beside the voice that a model predicts: see FOLLOWS, BROAD, COHERENT, PEAKED."""
+def is_codec(measurement: Measurement, voice: Samples) -> bool:
+    """Whether what is left beside the voice (n,), whitened, as a model predicts it, is a codec's; a linear path of its own is taken out.
 
-    follows: float
-    broad: float
-    coherent: float
-    peaked: float
-
-    @property
-    def of_a_codec(self) -> bool:
-        """Whether all of them are."""
-        alike = self.follows > FOLLOWS and self.broad > BROAD
-        return alike and self.coherent < COHERENT and self.peaked < PEAKED
-
-
-def signs_of(evidence: Evidence) -> Signs:
-    """What is left of the voice as predicted before the effect, a linear path of its own taken out."""
-    measurement = evidence.grid.measurement
-    voice = measurement.whiten(evidence.before.prediction)
+    It follows the voice's level (FOLLOWS), and has neither its phase (COHERENT) nor its harmonics (PEAKED).
+    """
     left = measurement.white_recording - voice
     taps = fit_filter(voice, left, measurement.weights, TAPS, LEAD, prior=np.full(TAPS, 1e-3), steps=15)
     fine = convolve_from(voice, taps, LEAD)
     voice, left = voice + fine, left - fine
-    heard = evidence.grid.usable & (uniform_filter1d(voice * voice, LONG[0]) > HEARD)
-    said, rest, use = _spectra(voice, *SHORT), _spectra(left, *SHORT), _whole(heard, *SHORT)
-    return Signs(*_follows(said, rest, use), _coherent(said, rest, use), _peaked(left, heard))
+    heard = (measurement.weights > 0.0) & (uniform_filter1d(voice * voice, LONG[0]) > HEARD)
+    cells = _spectra(voice, *SHORT), _spectra(left, *SHORT), _whole(heard, *SHORT)
+    return _follows(*cells) > FOLLOWS and _coherent(*cells) < COHERENT and _peaked(left, heard) < PEAKED
 
 
 def _spectra(x: Samples, size: int, hop: int) -> NDArray[np.complex64]:
@@ -84,8 +64,8 @@ def _whole(heard: NDArray[np.bool_], size: int, hop: int) -> NDArray[np.bool_]:
     return frames(heard.astype(np.float32), size, hop).mean(axis=1) > 0.9
 
 
-def _follows(said: NDArray[np.complex64], rest: NDArray[np.complex64], whole: NDArray[np.bool_]) -> tuple[float, float]:
-    """Correlation of the levels of both (frames, bins) in dB, within bands over time, where both are over the fan; and Signs.broad."""
+def _follows(said: NDArray[np.complex64], rest: NDArray[np.complex64], whole: NDArray[np.bool_]) -> float:
+    """Correlation of the levels of both (frames, bins) in dB, within bands over time, where both are over the fan."""
     edges = np.unique(np.geomspace(1, SHORT[0] // 2 - 12, 16).astype(int))
     over, loud = (
         np.add.reduceat(uniform_filter(power_of(spectra), (5, 1)), edges[:-1], axis=1)[:, :-1] / np.diff(edges)[:-1]
@@ -97,14 +77,7 @@ def _follows(said: NDArray[np.complex64], rest: NDArray[np.complex64], whole: ND
     for level in (decibels(np.maximum(over - 1.0, 0.1)), decibels(np.maximum(loud, 0.1))):
         swings.append(use * (level - (use * level).sum(axis=0) / count))
     a, b = swings
-    correlation = float(np.sum(a * b) / np.sqrt(np.sum(a * a) * np.sum(b * b) + 1e-12))
-    return correlation, _breadth(over[whole], loud[whole])
-
-
-def _breadth(over: Array, loud: Array) -> float:
-    """Part of the bands in which the voice (frames, bands) is well over the fan where the residual (frames, bands) stands out of it."""
-    clear = loud.mean(axis=0) > CLEAR
-    return float(np.mean(over.mean(axis=0)[clear] > STANDS_OUT)) if clear.any() else 0.0
+    return float(np.sum(a * b) / np.sqrt(np.sum(a * a) * np.sum(b * b) + 1e-12))
 
 
 def _coherent(said: NDArray[np.complex64], rest: NDArray[np.complex64], use: NDArray[np.bool_]) -> float:
@@ -130,9 +103,9 @@ def _explained(
 
 
 def _peaked(left: Samples, heard: NDArray[np.bool_]) -> float:
-    """Signs.peaked."""
+    """Standard deviation of the log of the residual's (n,) fine structure over frequency, where the voice is heard."""
     power = power_of(_spectra(left, *LONG))[:, : LONG[0] * 3 // 16]
     log = np.log(power + 1e-6)
     use = _whole(heard, *LONG)[:, None] & (uniform_filter1d(power, AROUND, axis=1) > 2.0 * HEARD)
     fine = (log - uniform_filter1d(log, AROUND, axis=1)) * use
-    return float(np.sqrt(np.sum(fine * fine) / max(np.count_nonzero(use), 1))) / OF_NOISE
+    return float(np.sqrt(np.sum(fine * fine) / max(np.count_nonzero(use), 1)))

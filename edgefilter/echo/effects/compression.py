@@ -7,18 +7,17 @@ from itertools import product
 import numpy as np
 import scipy
 
-from edgefilter.echo.effect import Effect, Parameter, Runner, complete, first, neutral, within
-from edgefilter.echo.effects.gain_fit import GainFit, Reach
+from edgefilter.echo.effect import Effect, Parameter, Runner, first, within
+from edgefilter.echo.effects.gain_fit import Reach, fit_one
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
-from edgefilter.types import SAMPLE_RATE, Array, Samples
+from edgefilter.types import Array, Samples
 
-STARTS = tuple(product((1.0, -3.0, -8.0, -15.0), (0.2, 0.6), (60.0, 300.0)))
-"""Thresholds in dB re the loudest 20 ms of the reference, slopes in dB per dB and releases in ms to start from."""
+STARTS = tuple(product((1.0, -3.0, -8.0, -15.0), (0.2, 0.6), np.log([8.0]), np.log([60.0, 300.0])))
+"""Thresholds in dB re the loudest 20 ms of the reference, slopes in dB per dB, logarithms of attack and release in ms to start from."""
 STEEPEST = 0.98
 """Slope, dB per dB: a ratio of 50 to 1 lets no more through than a limiter does."""
 REACH = Reach(
     nudge=np.array([0.5, 0.03, 0.15, 0.15]),
-    longest=np.array([4.0, 0.3, 1.0, 1.0]),
     lowest=np.array([-80.0, 0.0, np.log(0.3), np.log(5.0)]),
     highest=np.array([0.0, STEEPEST, np.log(200.0), np.log(5000.0)]),
 )
@@ -39,7 +38,6 @@ class Compression(Effect):
     title = "compression"
     shown_by = ("levels",)
     complexity = 2
-    cost = 2
     flexible = True
     parameters = (
         Parameter("threshold_db", "dB re full scale", -20.0, -80.0, 0.0),
@@ -57,18 +55,8 @@ class Compression(Effect):
         return Compressor(values, sample_rate)
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """Gauss-Newton in threshold, ratio, attack and release from the best of a grid; neutral where they do not pay (GainFit)."""
-
-        def compressed(x: Samples, unknowns: Array) -> tuple[Samples]:
-            return (self.apply(x, complete(self, self._values(unknowns)), SAMPLE_RATE),)
-
-        fit = GainFit(measurement, model, compressed, REACH)
-        starts = [np.array((fit.loud_db + above, slope, np.log(8.0), np.log(ms))) for above, slope, ms in STARTS]
-        found = fit.best(starts)
-        if found is None or found[0][1] < 0.01:
-            return neutral(self)
-        makeup_db = 20.0 * np.log10(max(float(fit.gains(found[0])[0]), 1e-2))
-        return within(self, {**self._values(found[0]), "makeup_db": makeup_db})
+        """From the best of a grid of thresholds, slopes and releases (gain_fit)."""
+        return fit_one(self, measurement, model, self._values, REACH, STARTS)
 
     def _values(self, unknowns: Array) -> Values:
         threshold_db, slope, attack, release = unknowns

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from edgefilter.echo.effect import Effect, Parameter, first, neutral, within
-from edgefilter.echo.effects.late_reverb import ADDED, fit_path, rings_longer, with_added
-from edgefilter.echo.evidence import Evidence
+from edgefilter.echo.effects.late_reverb import ADDED, fit_path, with_added
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 
@@ -28,7 +27,6 @@ class EarlyPath(Effect):
     title = "another path from the start"
     shown_by = ("sweep", "place")
     complexity = 4
-    cost = 4
     flexible = True
     parameters = (
         Parameter("level_db", "dB", -120.0, -120.0, 60.0),
@@ -40,9 +38,9 @@ class EarlyPath(Effect):
         return with_added(x, values)
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """What fit_path() finds, which late_reverb shares; neutral where none of it holds on other samples."""
-        added, _ = measurement.once(fit_path, model)
-        if not added.any():
+        """What fit_path() finds, which late_reverb shares; neutral where none of it holds on other samples, or the room sounds longer."""
+        added, _, longer = measurement.once(fit_path, model)
+        if longer or not added.any():
             return neutral(self)
         grown = np.cumsum(added**2)
         level_db = 10.0 * np.log10(grown[-1] / np.sum(model.response().astype(float) ** 2) + 1e-12)
@@ -54,7 +52,3 @@ class EarlyPath(Effect):
             f"direct sound and reflections, most of them within {max(first(values, 'within_ms'), 0.0):.0f} ms, are"
             " others than at the calibration, from the first second to the last; the room dies away as it did"
         )
-
-    def plausible(self, evidence: Evidence) -> bool:
-        """Whether the room does not sound longer than it did: else the room is another."""
-        return not rings_longer(evidence)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from scipy import fft
 
 from edgefilter.dsp.fourier import log_response
-from edgefilter.echo.effect import Effect, Parameter, numbers
-from edgefilter.echo.evidence import Evidence
+from edgefilter.echo.effect import Effect, Parameter, neutral, numbers
 from edgefilter.echo.measurement import ORDINARY_DB, Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import DELAYS, Spectra, convolve_from, fit_filter, spectra
 from edgefilter.types import SAMPLE_RATE, Array, Samples
@@ -20,12 +20,9 @@ LOWEST_HZ, HIGHEST_HZ, KNOTS = 80.0, 7600.0, 40
 FFT = 4096
 TAPS, LEAD, EXPECTED = 48, 16, 1e-4
 """Of the filter that takes up what a smooth gain of least phase is not: 3 ms, and a hundredth for each tap."""
-STEPS, DAMPING, BEND = 12, 1e-3, 3e-3
-"""Of the fit: how often it is made linear anew, how strongly it is held, and how strongly the gain is kept smooth, both
-re the energy of a knot."""
+BEND = 3e-3
+"""How strongly the gain is kept smooth, re the energy of a knot."""
 MOST_DB = 40.0
-HEARD = 1e-3
-"""Part of the loudest knot's energy from which on a knot is heard."""
 
 
 class Equaliser(Effect):
@@ -33,7 +30,7 @@ class Equaliser(Effect):
 
     Its phase is the least that the gain allows (Oppenheim & Schafer 2010, eq. 12.35), as analogue filters, their
     digital likenesses and loudspeakers have it, but for a delay in samples. taps: (k,) lags -LEAD to k - LEAD, by which
-    the real filter differs from that one. range_db only reports: from the least to the largest gain that is heard.
+    the real filter differs from that one. range_db only reports: from the least to the largest gain.
     """
 
     name = "equaliser"
@@ -64,16 +61,17 @@ class Equaliser(Effect):
         return y + convolve_from(x, taps, LEAD) if taps.any() else y
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """Gauss-Newton in the gains of all knots and the delay, in the whitened cross-spectrum; then taps."""
+        """Levenberg-Marquardt in the gains of all knots and the delay, in the whitened cross-spectrum; then taps. Neutral for a turned volume."""
         x = measurement.predicted(model)[1]
         found = spectra(measurement, x, SAMPLE_RATE / FFT)
         knots, delay = _smooth_gain(found)
         gain_db = np.clip(knots * (20.0 / np.log(10.0)), -MOST_DB, MOST_DB)
+        if float(np.std(gain_db)) < ORDINARY_DB:
+            return neutral(self)
         values = {"gain_db": gain_db, "delay": delay, "taps": 0.0}
         left = measurement.white_recording - self.apply(x, values, SAMPLE_RATE)
         taps = fit_filter(x, left, measurement.weights, TAPS, LEAD, prior=np.full(TAPS, EXPECTED), steps=20)
-        heard = gain_db[_heard(found)]
-        return {**values, "taps": np.clip(taps, -10.0, 10.0), "range_db": float(np.ptp(heard)) if heard.size else 0.0}
+        return {**values, "taps": np.clip(taps, -10.0, 10.0), "range_db": float(np.ptp(gain_db))}
 
     def sentence(self, values: Values) -> str:
         """Where it is loudest and where softest."""
@@ -83,10 +81,6 @@ class Equaliser(Effect):
             f"the voice has another colour, smooth over frequency and the same at all levels: {gain_db[high]:+.1f} dB"
             f" around {hz[high]:.0f} Hz, {gain_db[low]:+.1f} dB around {hz[low]:.0f} Hz"
         )
-
-    def plausible(self, evidence: Evidence) -> bool:
-        """Whether it is more than a turned volume."""
-        return float(np.std(evidence.values["gain_db"])) >= ORDINARY_DB
 
 
 def knots_hz(count: int) -> Array:
@@ -109,38 +103,17 @@ def _smooth_gain(found: Spectra) -> tuple[Array, float]:
     whole = _basis(FFT // 2 + 1, SAMPLE_RATE, KNOTS)
     at = np.clip(np.rint(found.hz * FFT / SAMPLE_RATE).astype(int), 0, FFT // 2)
     basis = np.concatenate((whole[at], -2j * np.pi * found.hz[:, None] / SAMPLE_RATE), axis=1)
-    energy = np.maximum(found.predicted, 1e-12)
-    size = float(np.max(energy @ np.abs(basis[:, :-1]) ** 2))
-    bent = np.diff(np.eye(KNOTS), 2, axis=0)
-    penalty = np.zeros((basis.shape[1],) * 2)
-    penalty[:-1, :-1] = BEND * size * (bent.T @ bent)
+    root = np.sqrt(np.maximum(found.predicted, 1e-12))
+    stiff = np.sqrt(BEND * float(np.max(root**2 @ np.abs(basis[:, :-1]) ** 2)))
+    bends = stiff * np.pad(np.diff(np.eye(KNOTS), 2, axis=0), ((0, 0), (0, 1)))
 
-    def cost(a: Array) -> float:
-        response = np.exp(basis @ a)
-        own = float(np.sum(np.abs(response) ** 2 * energy - 2.0 * (response.conj() * found.cross).real))
-        return own + float(a @ penalty @ a)
+    def residual(a: Array) -> Array:
+        left = root * np.exp(basis @ a) - found.cross / root
+        return np.concatenate((left.real, left.imag, bends @ a))
 
-    a = np.append(np.zeros(KNOTS), delay)
-    now, damping = cost(a), DAMPING
-    for _ in range(STEPS):
-        response = np.exp(basis @ a)
-        slope = response[:, None] * basis
-        normal = (slope.conj().T @ (energy[:, None] * slope)).real + penalty
-        right = (slope.conj().T @ (found.cross - energy * response)).real - penalty @ a
-        step = np.linalg.solve(normal + damping * np.diag(normal.diagonal() + 1e-9 * size), right)
-        there = a + np.clip(step, -1.0, 1.0)
-        then = cost(there)
-        if then < now:
-            settled, a, now, damping = now - then < 1e-5 * abs(now), there, then, 0.3 * damping
-            if settled:
-                break
-        else:
-            damping = 10.0 * max(damping, 1e-4)
-    return a[:-1], float(np.clip(a[-1], -100.0, 100.0))
+    def slopes(a: Array) -> Array:
+        slope = (root * np.exp(basis @ a))[:, None] * basis
+        return np.concatenate((slope.real, slope.imag, bends))
 
-
-def _heard(found: Spectra) -> NDArray[np.bool_]:
-    """Where the voice has energy enough to tell a gain, (knots,) bool."""
-    at = np.clip(np.rint(found.hz * FFT / SAMPLE_RATE).astype(int), 0, FFT // 2)
-    energy = found.predicted @ _basis(FFT // 2 + 1, SAMPLE_RATE, KNOTS).real[at]
-    return np.asarray(energy > HEARD * energy.max())
+    solved = scipy.optimize.least_squares(residual, np.append(np.zeros(KNOTS), delay), slopes, method="lm", ftol=1e-8)
+    return solved.x[:-1], float(np.clip(solved.x[-1], -100.0, 100.0))

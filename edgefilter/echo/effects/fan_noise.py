@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from edgefilter.dsp.frames import frames
+from edgefilter.dsp.frames import decibels, frames
 from edgefilter.dsp.psd import floored, periodograms
 from edgefilter.dsp.tones import tones
 from edgefilter.echo.effect import Effect, Parameter, first, neutral, within
-from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.least_squares import absorbed
 from edgefilter.echo.measurement import SILENT, STEADY_DB, Measurement, Values, VoiceModel
 from edgefilter.types import Array, Samples
@@ -44,15 +43,16 @@ class FanNoise(Effect):
 
         Where the robot is hardly ever silent, the mean of the quietest quarter of all frames at each frequency, divided
         by what that share of an exponential distribution has as its mean (the idea of Martin 2001, "minimum
-        statistics", without its tracking).
+        statistics", without its tracking). Neutral where the silences are not as likely so, swing or hum.
         """
         known = measurement.noise_psd
         if known is None:
             return neutral(self)
         voice = absorbed(measurement.predicted(model)[0], measurement.recording, measurement.fit)
         size = 2 * (known.size - 1)
-        residual = periodograms(measurement.recording - voice, size)
-        if not len(residual):
+        left = measurement.recording - voice
+        residual = periodograms(left, size)
+        if not len(residual) or tones(left, known)[1]:
             return neutral(self)
         whole = frames(measurement.weights, size, size // 2).all(axis=1)
         own = np.mean(frames(measurement.whiten(voice), size, size // 2) ** 2, axis=1)
@@ -61,6 +61,11 @@ class FanNoise(Effect):
             found = residual[silent].mean(axis=0)
         else:
             found = _quiet_mean(residual[whole] if whole.any() else residual)
+        if silent.any():
+            heard, was, now = residual[silent], floored(known), floored(found)
+            swing_db = np.ptp(decibels(np.quantile(np.mean(heard / now, axis=1), (0.1, 0.9))))
+            if swing_db > STEADY_DB or np.mean(np.log(now / was) + heard / now - heard / was) > 0.0:
+                return neutral(self)
         floor = floored(known if measurement.calibrated_psd is None else measurement.calibrated_psd)
         smooth = np.convolve(np.pad(found / floor, 1, mode="edge"), SMOOTH, "valid")
         total = 10.0 * np.log10(np.sum(smooth * floor) / np.sum(floor) + 1e-30)
@@ -71,14 +76,6 @@ class FanNoise(Effect):
             f"the noise is {first(values, 'change_db'):+.1f} dB off the calibrated fan, with the robot's voice and"
             " without it"
         )
-
-    def plausible(self, evidence: Evidence) -> bool:
-        """Whether the robot's silences, or all where it is never silent, sound like that fan, and no hum of the mains is in them."""
-        measurement = evidence.grid.measurement
-        known, residual = measurement.noise_psd, measurement.recording - evidence.after.prediction
-        heard, left_db = evidence.silent_gain_db, evidence.after.excess_db
-        steady = left_db < STEADY_DB if np.isnan(heard) else heard > 0.0 and evidence.swing_db < STEADY_DB
-        return steady and known is not None and not tones(residual, known)[1]
 
 
 def _quiet_mean(power: Array) -> Array:

@@ -12,7 +12,7 @@ from scipy.ndimage import map_coordinates
 
 from edgefilter.dsp.frames import block_power, block_sums, blocks, decibels
 from edgefilter.echo.effect import Effect, Parameter, Runner, Stage, first, neutral, numbers, vanishes, within
-from edgefilter.echo.least_squares import filtered, normal_equations
+from edgefilter.echo.least_squares import filtered, hats, normal_equations
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import fit_filter
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
@@ -60,7 +60,6 @@ class FreeLaw(Effect):
 
     free = True
     flexible = True
-    cost = 5
 
     @property
     def told(self) -> tuple[Parameter, ...]:
@@ -139,7 +138,7 @@ class FreeCurve(FreeLaw):
         slopes = np.diff(np.eye(knots.size), axis=0) / np.diff(knots)[:, None]
         bends = np.delete(np.diff(slopes, axis=0), middle, axis=1)
         bends *= 1.0 / np.sqrt(np.trace(bends.T @ bends) / bends.shape[1])
-        parts = np.delete(_hats(ground.x / peak, knots, beyond=True), middle, axis=0)
+        parts = np.delete(hats(ground.x / peak, knots, beyond=True), middle, axis=0)
         return {"peak": peak, "bend": np.insert(ground.solve(list(parts), bends) / peak, middle, 0.0) - knots}
 
     def drawn(self, values: Values) -> Drawn:
@@ -180,7 +179,6 @@ class FreeGain(FreeLaw):
     stage: ClassVar[Stage] = "source"
     family = "dynamics"
     title = "a gain by level"
-    cost = 10
     shown_by = ("levels",)
     parameters = (
         Parameter("loudest_db", "dB re full scale", 0.0, -100.0, 100.0),
@@ -208,8 +206,8 @@ class FreeGain(FreeLaw):
 
         def best(settings: list[Times]) -> Times:
             def worth(level: Array, times: Times) -> float:
-                hats = _hats(level, knots(times))
-                return _solved((hats * energy) @ hats.T, hats @ cross, bends)[1]
+                parts = hats(level, knots(times))
+                return _solved((parts * energy) @ parts.T, parts @ cross, bends)[1]
 
             levels = _levels(ground.x, settings)
             return settings[int(np.argmax([worth(*pair) for pair in zip(levels, settings, strict=True)]))]
@@ -230,7 +228,7 @@ class FreeGain(FreeLaw):
         drawn = np.interp(
             np.arange(ground.x.size) / STEP, np.arange(level.size + 1), np.concatenate((level[:1], level))
         )
-        gain = ground.solve([ground.x * hat for hat in _hats(drawn, knots(times))], bends)
+        gain = ground.solve([ground.x * hat for hat in hats(drawn, knots(times))], bends)
         gain_db = np.clip(20.0 * np.log10(np.maximum(gain, 1e-3)), -40.0, 40.0)
         return {
             "loudest_db": loud_db + OVER_DB[times.peak],
@@ -335,7 +333,7 @@ class FreeModulation(FreeLaw):
 
     def fitted(self, ground: _Ground) -> Values:
         energy, cross = ground.sums(STEP)
-        rates, worth, _ = by_rate(energy, cross, *RATES_HZ)
+        rates, worth = _by_rate(energy, cross)
         if rates.size < 2:
             return {}
 
@@ -403,13 +401,13 @@ class FreeLag(FreeLaw):
 
     def fitted(self, ground: _Ground) -> Values:
         middle = LAG_STEP * (np.arange(ground.x.size // LAG_STEP) + 0.5) / SAMPLE_RATE
-        hats = _hats(middle, np.arange(2.0 + ground.x.size // SAMPLE_RATE))
-        lag, bends = np.zeros(len(hats)), np.diff(np.eye(len(hats)), 2, axis=0)
+        parts = hats(middle, np.arange(2.0 + ground.x.size // SAMPLE_RATE))
+        lag, bends = np.zeros(len(parts)), np.diff(np.eye(len(parts)), 2, axis=0)
         for _ in range(LAG_ROUNDS):
             moved = self.apply(ground.x, {**neutral(self), "lag": lag}, SAMPLE_RATE)
             slope, left = ground.part(np.gradient(moved).astype(np.float32)), ground.target - ground.part(moved)
             energy, cross = (block_sums(slope * other * ground.weights, LAG_STEP) for other in (slope, -left))
-            lag = lag + _solved((hats * energy) @ hats.T, hats @ cross, bends)[0]
+            lag = lag + _solved((parts * energy) @ parts.T, parts @ cross, bends)[0]
         return {"lag": lag[: ground.x.size // SAMPLE_RATE + 1]} if np.isfinite(lag).all() else {}
 
     def drawn(self, values: Values) -> Drawn:
@@ -437,15 +435,15 @@ class FreeGainBehind(FreeGain):
     title = "a gain behind the path by level"
 
 
-def by_rate(energy: Array, cross: Array, lowest_hz: float, highest_hz: float) -> tuple[Array, Array, Array]:
-    """Of each rate (k,) in Hz the energy that a gain 1 + a cos + b sin at it explains, (k,), and its depth, (k,).
+def _by_rate(energy: Array, cross: Array) -> tuple[Array, Array]:
+    """Of each rate (k,) in Hz the energy that a gain 1 + a cos + b sin at it explains, (k,).
 
     From sums over each STEP of voice times voice, and voice times recording.
     """
     size = RATES_PER_CYCLE * energy.size
     per = SAMPLE_RATE / STEP / max(size, 1)
     own, other = np.fft.rfft(energy, size), np.fft.rfft(cross, size)
-    rates = np.arange(max(round(lowest_hz / per), 1), min(round(highest_hz / per), own.size // 2))
+    rates = np.arange(max(round(RATES_HZ[0] / per), 1), min(round(RATES_HZ[1] / per), own.size // 2))
     at, twice, seen = own[rates], own[2 * rates], other[rates]
     even, odd, both = 0.5 * (own[0] + twice).real, 0.5 * (own[0] - twice).real, -0.5 * twice.imag
     whole = np.full(rates.size, own[0].real)
@@ -454,8 +452,7 @@ def by_rate(energy: Array, cross: Array, lowest_hz: float, highest_hz: float) ->
     right = np.stack((np.full(rates.size, other[0].real), seen.real, -seen.imag), axis=1)
     matrix += (1e-6 * own[0].real + 1e-30) * np.eye(3)
     found = np.linalg.solve(matrix, right[:, :, None])[:, :, 0]
-    depth = np.hypot(found[:, 1], found[:, 2]) / np.maximum(np.abs(found[:, 0]), 1e-6)
-    return rates * per, np.sum(found * right, axis=1), depth
+    return rates * per, np.sum(found * right, axis=1)
 
 
 def _spread(values: Values, name: str, size: int) -> Array:
@@ -489,20 +486,6 @@ def _levels(x: Samples, settings: Sequence[Times], before_db: float = FLOOR_DB) 
         now = now + np.where(step > 0.0, rising, falling) * step
         row[:] = now
     return 10.0 * np.log10(level.T) / exponents[:, None]
-
-
-def _hats(x: Array, knots: Array, beyond: bool = False) -> Array:
-    """Parts whose sum by heights at the knots (k,) is the curve through these at x (n,), (k, n) float32.
-
-    beyond: whether it goes on as it ends outside of the knots, rather than level.
-    """
-    left = np.clip(np.searchsorted(knots, x) - 1, 0, knots.size - 2)
-    share = ((x - knots[left]) / (knots[left + 1] - knots[left])).astype(np.float32)
-    share = share if beyond else np.clip(share, 0.0, 1.0)
-    hats = np.zeros((knots.size, x.size), np.float32)
-    at = np.arange(x.size)
-    hats[left, at], hats[left + 1, at] = 1.0 - share, share
-    return hats
 
 
 def _solved(matrix: Array, right: Array, bends: Array) -> tuple[Array, float]:

@@ -6,7 +6,6 @@ import numpy as np
 
 from edgefilter.dsp.frames import blocks
 from edgefilter.echo.effect import Effect, Parameter, first, neutral, numbers, within
-from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import LONGEST, convolve_from, fit_filter, fit_supported
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
@@ -21,8 +20,6 @@ BLOCK = 320
 """Samples (20 ms) over which the energy of taps is summed."""
 DIRECT = 48
 """Samples up to which no reflection of a room comes: a detour of a metre. A change there is another effect's."""
-EARLY, LATE_SHARE = round(0.03 * SAMPLE_RATE), 0.1
-"""Samples up to which reflections are early, and the least share of the added energy after those where the room is another."""
 LONGER, DECAYED = 1.3, 0.01
 """By this factor the time until DECAYED of the energy is left exceeds the calibration's: 2 to 20 in rooms of 0.4 to 0.8
 s, 0.9 to 1.1 where the change was another one. So far down a sweep's response is clear of its noise."""
@@ -57,9 +54,9 @@ class LateReverb(Effect):
         return with_added(x, values)
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """What fit_path() finds, which early_path shares; neutral where none of it holds on other samples."""
-        added, rt60 = measurement.once(fit_path, model)
-        if not added.any():
+        """What fit_path() finds, which early_path shares; neutral where none of it holds on other samples, or the room sounds no longer."""
+        added, rt60, longer = measurement.once(fit_path, model)
+        if not longer:
             return neutral(self)
         late = float(np.sum(added[PRE_ROLL + SAMPLE_RATE // 100 :] ** 2) / np.sum(model.response() ** 2))
         return within(self, {"rt60_s": rt60, "level_db": 10 * np.log10(late + 1e-12), "added": added})
@@ -76,10 +73,6 @@ class LateReverb(Effect):
         added[: PRE_ROLL + DIRECT] = 0.0
         return {**values, "added": added}
 
-    def plausible(self, evidence: Evidence) -> bool:
-        """Whether the room is longer: a loudspeaker of another colour or a path that moved fill a filter this long as well."""
-        return rings_longer(evidence)
-
 
 def with_added(response: Samples, values: Values, lead: int = LEAD) -> Samples:
     """The response (k,) with what is added to it, or what a filter behind it adds, its taps from lag -lead on, (k,)."""
@@ -89,25 +82,29 @@ def with_added(response: Samples, values: Values, lead: int = LEAD) -> Samples:
     return changed
 
 
-def fit_path(measurement: Measurement, model: VoiceModel) -> tuple[Array, float]:
-    """What is added to the response, (k,), zeros where none of it holds on other samples; RT60 of the new response in s.
+def fit_path(measurement: Measurement, model: VoiceModel) -> tuple[Array, float, bool]:
+    """What is added to the response, (k,), zeros where none of it holds on other samples; RT60 of the new response in s; whether that is longer.
 
     Least squares in the whitened domain, slightly regularised, then once more with taps that are expected to decay as the
     room that was found does: some seconds of speech do not teach ten thousand.
     """
     before = model.response().astype(np.float64)
     x, residual, scale = beside(measurement, model)
-    length = min(LONGEST, measurement.recording.size // 4)
+    length, direct = min(LONGEST, measurement.recording.size // 4), int(np.argmax(np.abs(before)))
+
+    def after(taps: Array) -> Array:
+        """The new response from the direct sound on."""
+        whole = np.pad(before, (0, max(length - before.size, 0)))
+        whole[:length] += scale * taps
+        return whole[direct:]
+
     taps = fit_supported(x, residual, measurement.weights, 0, np.full(length, EXPECTED))
     if not taps.any():
-        return taps, 0.0
-    after = scale * taps
-    after[: before.size] += before[:length]
-    direct = int(np.argmax(np.abs(before)))
-    rt60 = reverberation_time(after[direct:]) or reverberation_time(before[direct:])
+        return taps, 0.0, False
+    rt60 = reverberation_time(after(taps)) or reverberation_time(before[direct:])
     if rt60 > 0.0:
         taps = fit_filter(x, residual, measurement.weights, length, 0, decaying(taps, SLOWER * rt60), steps=60)
-    return scale * taps, rt60
+    return scale * taps, rt60, decay(after(taps)) > LONGER * decay(before[direct:])
 
 
 def beside(measurement: Measurement, model: VoiceModel) -> tuple[Samples, Samples, float]:
@@ -115,19 +112,6 @@ def beside(measurement: Measurement, model: VoiceModel) -> tuple[Samples, Sample
     scale = float(np.sqrt(np.sum(np.square(model.response(), dtype=np.float64))))
     tap = measurement.predicted(model.over(np.array([scale], np.float32)))[1]
     return tap, measurement.white_recording - measurement.predicted(model)[1], scale
-
-
-def rings_longer(evidence: Evidence) -> bool:
-    """Whether a good part of what taps add, a gain apart, comes after early reflections, and the whole decays more slowly."""
-    path = evidence.model.response().astype(np.float64)
-    direct = int(np.argmax(np.abs(path)))
-    before, added = path[direct:], numbers(evidence.values, "added")[direct:]
-    after = np.pad(before, (0, max(added.size - before.size, 0)))
-    known = after[: added.size].copy()
-    after[: added.size] += added
-    added = added - float(added @ known) / float(known @ known) * known
-    late = float(np.sum(added[EARLY:] ** 2)) >= LATE_SHARE * float(np.sum(added**2))
-    return late and decay(after) > LONGER * decay(before)
 
 
 def block_energy(taps: Array) -> tuple[Array, float]:

@@ -6,21 +6,20 @@ from itertools import product
 
 import numpy as np
 
-from edgefilter.echo.effect import Effect, Parameter, Runner, complete, first, neutral, within
+from edgefilter.echo.effect import Effect, Parameter, Runner, first, within
 from edgefilter.echo.effects.compression import falling_peak
-from edgefilter.echo.effects.gain_fit import GainFit, Reach
+from edgefilter.echo.effects.gain_fit import Reach, fit_one
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
-from edgefilter.types import SAMPLE_RATE, Array, Samples
+from edgefilter.types import Array, Samples
 
 NEVER_DB = 60.0
 """Re full scale: a ceiling that no signal reaches."""
-STARTS = tuple(product((9.0, 6.0, 3.0, 0.0, -5.0), (20.0, 100.0, 500.0)))
-"""Ceilings in dB re the loudest 20 ms of the reference, 10 dB under its peaks, and releases in ms to start from."""
+STARTS = tuple(product((9.0, 6.0, 3.0, 0.0, -5.0), np.log([20.0, 100.0, 500.0])))
+"""Ceilings in dB re the loudest 20 ms of the reference, 10 dB under its peaks, and logarithms of releases in ms to start from."""
 SHORTEST_MS = 10.0
 """What lets go faster, within a period of the voice, bends the wave itself: that is distortion."""
 REACH = Reach(
     nudge=np.array([0.3, 0.15]),
-    longest=np.array([3.0, 1.0]),
     lowest=np.array([-80.0, np.log(SHORTEST_MS)]),
     highest=np.array([0.0, np.log(5000.0)]),
 )
@@ -41,7 +40,6 @@ class Limiter(Effect):
     title = "a limiter"
     shown_by = ("levels",)
     complexity = 2
-    cost = 2
     parameters = (
         Parameter("ceiling_db", "dB re full scale", NEVER_DB, -80.0, NEVER_DB),
         Parameter("release_ms", "ms", 100.0, 1.0, 5000.0),
@@ -56,19 +54,10 @@ class Limiter(Effect):
         return PeakLimiter(values, sample_rate)
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """Gauss-Newton in ceiling and release from the best of a grid; neutral where they do not pay (GainFit)."""
-
-        def limited(x: Samples, unknowns: Array) -> tuple[Samples]:
-            return (self.apply(x, complete(self, self._values(unknowns)), SAMPLE_RATE),)
-
-        fit = GainFit(measurement, model, limited, REACH)
-        found = fit.best([np.array((fit.loud_db + db, np.log(ms))) for db, ms in STARTS])
-        if found is None:
-            return neutral(self)
-        values = self._values(found[0])
+        """From the best of a grid of ceilings and releases (gain_fit)."""
+        values = fit_one(self, measurement, model, self._values, REACH, STARTS)
         peak_db = 20.0 * np.log10(float(np.max(np.abs(measurement.reference), initial=0.0)) + 1e-12)
-        makeup_db = 20.0 * np.log10(max(float(fit.gains(found[0])[0]), 1e-2))
-        return within(self, {**values, "makeup_db": makeup_db, "taken_db": peak_db - first(values, "ceiling_db")})
+        return within(self, {**values, "taken_db": peak_db - first(values, "ceiling_db")})
 
     def _values(self, unknowns: Array) -> Values:
         return within(self, {"ceiling_db": unknowns[0], "release_ms": np.exp(unknowns[1])})

@@ -27,12 +27,9 @@ THRESHOLDS_DB, SLOPE = (-6.0, -15.0, -25.0), 0.5
 """Starting points, relative to the loudest 20 ms of the reference in each band, and dB per dB."""
 RELEASE_MS = 150.0
 RESOLUTION_HZ = 20.0
-WORTH = 0.05
-"""Of what the bands leave that are each only turned, so much less has to be left by bands that follow their level."""
 _EACH = np.ones(BANDS)
 REACH = Reach(
     nudge=np.concatenate((0.5 * _EACH, 0.03 * _EACH, [0.15, 0.15])),
-    longest=np.concatenate((4.0 * _EACH, 0.3 * _EACH, [1.0, 1.0])),
     lowest=np.concatenate((-80.0 * _EACH, 0.0 * _EACH, np.log([0.3, 5.0]))),
     highest=np.concatenate((0.0 * _EACH, STEEPEST * _EACH, np.log([200.0, 5000.0]))),
 )
@@ -53,7 +50,6 @@ class MultibandCompression(Effect):
     family = "dynamics"
     title = "multi-band compression"
     shown_by = ("levels", "sweep")
-    cost = 4
     flexible = True
     parameters = (
         Parameter("crossover_hz", "Hz", 1000.0, 20.0, 7500.0),
@@ -76,7 +72,7 @@ class MultibandCompression(Effect):
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """The crossovers from the spectra, then Gauss-Newton in the rest from the best of three starts.
 
-        Neutral where the bands' gains do not follow their levels.
+        Neutral where the bands do not pay.
         """
         crossed = find_crossovers(spectra(measurement, measurement.predicted(model)[1], RESOLUTION_HZ))
         if crossed is None:
@@ -89,9 +85,8 @@ class MultibandCompression(Effect):
             return BandCompressor(values, SAMPLE_RATE).bands(_moved(x, delay))
 
         fit = GainFit(measurement, model, parts, REACH)
-        still = fit.cost(_start(fit.loud_db, 0.0, 0.0))
         found = fit.best([_start(fit.loud_db, db, SLOPE) for db in THRESHOLDS_DB])
-        if found is None or found[1] > (1.0 - WORTH) * still:
+        if found is None:
             return neutral(self)
         makeup_db = np.clip(20.0 * np.log10(np.maximum(fit.gains(found[0]), 1e-2)), -MOST_DB, MOST_DB)
         return {**filters, **_values(found[0]), "delay": delay, "makeup_db": makeup_db}

@@ -10,7 +10,7 @@ from scipy.ndimage import uniform_filter1d
 from edgefilter.dsp.frames import decibels, frames
 from edgefilter.dsp.psd import floored, frequencies, hann, variance_at
 from edgefilter.echo.effect import Effect, Parameter, Runner, first, neutral, numbers, within
-from edgefilter.echo.evidence import Evidence
+from edgefilter.echo.least_squares import hats
 from edgefilter.echo.measurement import SILENT, Measurement, Values, VoiceModel
 from edgefilter.types import Array, Samples
 
@@ -85,23 +85,24 @@ class NoiseSuppression(Effect):
         return lambda x, heard=None: x
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """Least squares over the cells, the fan's variance 1 in each: the gains at the knots times what the loud cells of the band have."""
+        """Least squares over the cells, the fan's variance 1 in each: the gains at the knots times what the loud cells of the band have.
+
+        Neutral where silences and weak voice are not softer than calibrated, or the loud cells not as predicted.
+        """
         if measurement.noise_psd is None:
             return neutral(self)
         voice = measurement.predicted(model)[0]
         cells = Cells(measurement, voice, measurement.weights > 0.0)
-        knots = KNOTS_DB.size - 1
-        step = (np.eye(knots) - np.eye(knots, k=1)) / TRUST
-        left, right = step.T @ step, np.zeros(knots)
-        right[-1] = TRUST**-2
-        place = np.clip((cells.ratio_db - KNOTS_DB[0]) / (KNOTS_DB[1] - KNOTS_DB[0]), 0.0, knots)
-        hats = [np.maximum(0.0, 1.0 - np.abs(place - k)) for k in range(knots + 1)]
-        for i in range(knots):
-            right[i] += np.sum(hats[i] * (cells.cross - hats[-1] * cells.power))
-            for j in range(i, min(i + 2, knots)):
-                left[i, j] += np.sum(hats[i] * hats[j] * cells.power)
-                left[j, i] = left[i, j]
+        if cells.quiet_db > -LEAST_SOFTER_DB or cells.missed_db > MISSED_DB:
+            return neutral(self)
+        *parts, last = hats(cells.ratio_db, KNOTS_DB)
+        knots = len(parts)
+        step, right = (np.eye(knots) - np.eye(knots, k=1)) / TRUST, parts @ (cells.cross - last * cells.power)
+        right[-1] += TRUST**-2
+        left = step.T @ step + (parts * cells.power) @ np.transpose(parts)
         gain_db = 20.0 * np.log10(np.clip(np.linalg.solve(left, right), 1e-3, 3.9))
+        if gain_db[0] > -LEAST_SOFTER_DB:
+            return neutral(self)
         fan_db = 10.0 * np.log10(floored(measurement.noise_psd))
         return within(self, {"gain_db": gain_db, "fan_db": fan_db, "softer_db": cells.quiet_db})
 
@@ -112,14 +113,6 @@ class NoiseSuppression(Effect):
             f" voice less is let through the less it stands out of the fan: {at[-5]:.0f} dB at -5 dB over it, {at[5]:.0f}"
             f" dB at 5 dB, {at[15]:.0f} dB at 15 dB, all of it where it is loud"
         )
-
-    def plausible(self, evidence: Evidence) -> bool:
-        """Whether silences and weak voice are softer than calibrated, and the loud cells of the voice as predicted."""
-        measurement, values = evidence.grid.measurement, evidence.values
-        if max(first(values, "softer_db"), _gains(values)[0]) > -LEAST_SOFTER_DB or measurement.fit is None:
-            return False
-        held = evidence.grid.usable & ~measurement.fit
-        return Cells(measurement, evidence.before.prediction, held).missed_db <= MISSED_DB
 
 
 class Cells:

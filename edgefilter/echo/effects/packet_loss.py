@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from edgefilter.dsp.frames import block_power, frames
 from edgefilter.dsp.psd import total_power
 from edgefilter.echo.effect import NEVER_S, Effect, Parameter, first, neutral, numbers, within
-from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel, whiten
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
@@ -30,13 +29,9 @@ LOUD, MISSING, PREDICTED = 30.0, 0.5, 0.1
 what is left at most of half of the blocks where the voice is predicted at all."""
 CLEAR, SURE = 100.0, 25.0
 """Energy of a frame over the variance of the residual where it says something, and by which it must fall without the frame."""
-KEPT = 0.7
-"""Gain from which on a frame was played."""
-NEARLY = 0.97
-"""Of what the best grid explains, what one of longer frames must: two short frames are one of twice their length."""
-FEWEST, ALONE, OFF_GRID = 4, 0.6, 0.9
-"""Times that frames must be lost; share of them that lies between frames that were played; and what a grid half a frame off may
-explain at most of what the found one does. What a codec takes away, or a compressor, keeps to no grid."""
+FEWEST, OFF_GRID = 4, 0.9
+"""Times that frames must be lost, and what a grid half a frame off may explain at most of what the found one does. What a codec
+takes away, or a compressor, keeps to no grid."""
 DROPPED = 0.3
 """Of the fan's variance that must be there where a frame is missing: what the microphone itself lost has none."""
 FILLS, FADES_MS = np.linspace(0.0, 1.0, 11), (0.0, 1.0, 2.0, 4.0)
@@ -84,10 +79,13 @@ class PacketLoss(Effect):
         return out
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """The frames without which the error falls most, of all samples: a frame is lost once; their moment to a sample, and their fill."""
-        steps = _steps(measurement, model)
+        """The frames without which the error falls most, of all samples: a frame is lost once; their moment to a sample, and their fill.
+
+        Neutral where the fan is not heard in the meantime: what the microphone lost, it lost of both.
+        """
+        psd, steps = measurement.noise_psd, _steps(measurement, model)
         grid = None if steps is None else _best_grid(steps)
-        if grid is None:
+        if psd is None or grid is None:
             return neutral(self)
         length, start, lost = grid
         times = (start + np.flatnonzero(lost) * length) * STEP / SAMPLE_RATE
@@ -107,6 +105,11 @@ class PacketLoss(Effect):
             times = best("times_s", [np.maximum(times + move / SAMPLE_RATE, 0.0) for move in moves])
         for name, tried in (("fill", FILLS), ("fade_ms", FADES_MS), ("fill", FILLS)):
             found[name] = float(best(name, tried))
+        size = length * STEP
+        starts = np.round(times * SAMPLE_RATE).astype(int) + PRE_ROLL + size // 4
+        power = [np.mean(np.square(part)) for at in starts if (part := measurement.recording[at : at + size // 2]).size]
+        if np.median(power) <= DROPPED * total_power(psd):
+            return neutral(self)
         return within(self, {**found, "times_s": times, "lost": times.size})
 
     def sentence(self, values: Values) -> str:
@@ -118,17 +121,6 @@ class PacketLoss(Effect):
             f"{times.size} frames of {first(values, 'length_ms'):.0f} ms, all on one grid, are missing from the voice, and"
             f" {gap} was played instead: at {listed}"
         )
-
-    def plausible(self, evidence: Evidence) -> bool:
-        """Frames are missing from the voice, and the fan is there in the meantime: what the microphone lost, it lost of both."""
-        values, measurement = evidence.values, evidence.grid.measurement
-        if measurement.noise_psd is None or not evidence.values["lost"]:
-            return False
-        quarter = round(float(values["length_ms"]) * 1e-3 * SAMPLE_RATE / 4)
-        starts = np.round(numbers(values, "times_s") * SAMPLE_RATE).astype(int) + PRE_ROLL
-        middles = [measurement.recording[at + quarter : at + 3 * quarter] for at in starts]
-        power = [float(np.mean(np.square(part, dtype=np.float64))) for part in middles if part.size]
-        return bool(power) and float(np.median(power)) > DROPPED * total_power(measurement.noise_psd)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,22 +163,17 @@ def _steps(measurement: Measurement, model: VoiceModel) -> Steps | None:
 def _best_grid(steps: Steps) -> tuple[int, int, NDArray[np.bool_]] | None:
     """Steps of a frame, the first one's step, and which were lost, (frames,), of the grid that explains most; None for no packets."""
     tried = {(length, first): _without(steps, length, first) for length in LENGTHS for first in range(length)}
-    most = max(worth for worth, *_ in tried.values())
-    length, first = max(key for key, (worth, *_) in tried.items() if worth >= NEARLY * most)
-    worth, gain, sure, clear = tried[length, first]
+    length, first = max(tried, key=lambda grid: tried[grid][0])
+    worth, sure, clear = tried[length, first]
     lost = sure & clear
     beside = max(tried[length, (first + shift) % length][0] for shift in range(length // 4, length - length // 4 + 1))
     if np.count_nonzero(lost & ~np.roll(lost, 1)) < FEWEST or beside > OFF_GRID * worth:
         return None
-    played = clear & (gain > KEPT)
-    others = np.flatnonzero(~lost)
-    at, around = np.searchsorted(others, np.flatnonzero(lost)), np.pad(played[others], 1)
-    alone = np.count_nonzero(around[at] & around[at + 1])  # between two frames that were played
-    return (length, first, sure) if alone >= ALONE * np.count_nonzero(lost) else None
+    return length, first, sure
 
 
-def _without(steps: Steps, length: int, first: int) -> tuple[float, Array, NDArray[np.bool_], NDArray[np.bool_]]:
-    """What the lost frames of a grid explain, less the cost of saying which; of each its gain, whether surely lost, whether loud enough."""
+def _without(steps: Steps, length: int, first: int) -> tuple[float, NDArray[np.bool_], NDArray[np.bool_]]:
+    """What the lost frames of a grid explain, less the cost of saying which; of each whether surely lost, whether loud enough."""
     count = (steps.right.size - first) // length
     part = slice(first, first + count * length)
     right = steps.right[part].reshape(count, length).sum(axis=1)
@@ -197,4 +184,4 @@ def _without(steps: Steps, length: int, first: int) -> tuple[float, Array, NDArr
     clear = energy > CLEAR * steps.noise
     sure = fall > SURE
     cost = 2.0 * np.log(max(count, 2)) * np.count_nonzero(sure)
-    return float(fall[sure].sum() - cost), 1.0 + right / np.maximum(energy, 1e-9), sure, clear
+    return float(fall[sure].sum() - cost), sure, clear

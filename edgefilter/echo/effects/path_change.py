@@ -7,7 +7,6 @@ import numpy as np
 from edgefilter.dsp.frames import block_power
 from edgefilter.echo.effect import NEVER_S, Effect, Parameter, first, neutral, within
 from edgefilter.echo.effects.late_reverb import ADDED, beside, with_added
-from edgefilter.echo.evidence import Evidence
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import convolve_from, fit_supported
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
@@ -18,8 +17,6 @@ BLOCK = SAMPLE_RATE // 10
 """Samples (100 ms) of the steps in which the moment is looked for at first."""
 MARGIN = 1.5
 """Seconds at either end in which no change is looked for: it looks like a path that was another all along."""
-SLACK = 6.0
-"""Squared error, in variances of the fan, by which moments and fades are told apart: less is chance."""
 
 
 class PathChange(Effect):
@@ -52,46 +49,36 @@ class PathChange(Effect):
         return _fade(size, float(values["time_s"]), float(values["duration_s"]), sample_rate)
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """The time by the step in the residual, the new path by least squares after it, in turn; neutral where that does not hold.
+        """The time by the step in the residual, the new path by least squares after it, in turn.
+
+        Neutral where that does not hold, or would have held before: then it is another path all along.
 
         The moment alone is chosen on all samples, since it may fall between those that the fit may use.
         """
         x, residual, scale = beside(measurement, model)
-        time = _step(residual, measurement.predicted(model)[1])
+        time, edge = _step(residual, measurement.predicted(model)[1]), int(MARGIN * SAMPLE_RATE)
         for _ in range(2):
             after = measurement.weights * (np.arange(x.size) > (time + 0.3) * SAMPLE_RATE)
             taps = fit_supported(x, residual, after, 0, np.full(TAPS, EXPECTED))
             if not taps.any():
                 return neutral(self)
             change = convolve_from(x, taps, 0)
-            time = _best_time(residual, change, measurement.weights)
+            explained = np.cumsum(measurement.weights * change * (2.0 * residual - change), dtype=np.float64)
+            start = edge + int(np.argmin(explained[edge : max(x.size - edge, edge + 1)]))
+            time = start / SAMPLE_RATE
+        if explained[start] > 0.0:
+            return neutral(self)
         errors = {}
         for length in (0.01, 0.3, 0.6, 1.0):
             for at in time + np.arange(-0.6, 0.61, 0.1):
                 left = residual - _fade(x.size, at, length, SAMPLE_RATE) * change
                 errors[(at, length)] = float(np.dot(left, left))
-        most = min(errors.values()) + SLACK
-        as_good = [found for found, error in errors.items() if error <= most]
-        time, duration = min(as_good, key=lambda found: (found[1], abs(found[0] - time)))
+        time, duration = min(errors, key=lambda found: errors[found])
         time = min(time, x.size / SAMPLE_RATE)
         return within(self, {"time_s": time, "duration_s": duration, "added": scale * taps})
 
     def sentence(self, values: Values) -> str:
         return f"until {first(values, 'time_s'):.2f} s the calibrated path holds, from then on another one"
-
-    def plausible(self, evidence: Evidence) -> bool:
-        """Whether the path was the calibrated one until it changed: little of what is explained lies before that."""
-        grid, time = evidence.grid, float(evidence.values["time_s"])
-        early = grid.active_cells & (grid.starts < time * SAMPLE_RATE)
-        late = grid.active_cells & (grid.starts >= time * SAMPLE_RATE)
-        if early.sum() < 6 or late.sum() < 6:
-            return False
-        level, explained = (
-            10 * np.log10(np.maximum(score.cells, 1e-3)) @ grid.freedom / grid.freedom.sum()
-            for score in (evidence.before, evidence.after)
-        )
-        rest = float(np.mean(level[early]) - np.mean(explained[late]))
-        return rest < 0.5 * float(np.mean(level[late]) - np.mean(explained[late]))
 
 
 def _fade(n: int, time: float, duration: float, sample_rate: int) -> Samples:
@@ -118,10 +105,3 @@ def _step(residual: Samples, x: Samples) -> float:
         if score > best:
             best, at = score, k
     return at * BLOCK / SAMPLE_RATE
-
-
-def _best_time(residual: Samples, change: Samples, weights: Samples) -> float:
-    """Seconds from which on the change fits better than none: the split of least squared error."""
-    without = np.cumsum((residual.astype(float) ** 2 - (residual - change).astype(float) ** 2) * weights)
-    edge = int(MARGIN * SAMPLE_RATE)
-    return (edge + int(np.argmin(without[edge : max(without.size - edge, edge + 1)]))) / SAMPLE_RATE

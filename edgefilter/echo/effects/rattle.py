@@ -63,7 +63,6 @@ class Rattle(Effect):
     family = "additive noise"
     title = "a rattle"
     shown_by = ("levels", "tone")
-    cost = 8
     memory = 2048
     parameters = (
         Parameter("threshold", "full scale", NEVER_REACHED, 1e-5, NEVER_REACHED),

@@ -24,8 +24,6 @@ DRIVER, AMPLIFIER = ("force_factor", "stiffness", "damping"), ("even", "odd")
 """The laws, with two weights each."""
 RESONANCES_HZ, REACH_HZ = (250.0, 180.0, 215.0, 300.0, 370.0), (160.0, 1000.0)
 """Of small drivers, the usual one first; how low is tried, where MOTION_TAPS are just enough, and how high."""
-BESIDE = 1.1
-"""Times the best of these resonances, either way, that are tried next."""
 EXCURSION, KNEES = 0.7, (0.3, 0.15, 0.6)
 """Where the laws bend, re the largest displacement and the highest sample that the fit has seen; the usual ones first."""
 PEAK = 0.9999
@@ -56,7 +54,6 @@ class SpeakerNonlinearity(Effect):
     stage = "source"
     family = "static nonlinearity"
     title = "loudspeaker nonlinearity"
-    cost = 4
     shown_by = ("levels", "tone")
     flexible = True
     memory = MOTION_TAPS
@@ -230,8 +227,6 @@ class _Search:
 
         best = self._best(make, RESONANCES_HZ)
         if self.promising(best):
-            beside = [float(np.clip(best.setting * step, *REACH_HZ)) for step in (1.0 / BESIDE, BESIDE)]
-            best = min(best, *map(make, beside), key=_by_left)
             best = min(best, make(best.setting, 0.5 * EXCURSION), key=_by_left)
         return best
 

@@ -7,11 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.score import Scorer
-from edgefilter.diagnosis.select import _stepwise
-from edgefilter.diagnosis.trials import Workbench, added
 from edgefilter.dsp.psd import total_power
 from edgefilter.echo.model import EchoModel
 from tests.diagnosis.robot_scene import profile, record, voice
@@ -19,14 +15,14 @@ from tests.diagnosis.robot_scene import profile, record, voice
 
 @pytest.fixture(scope="module")
 def noisy():
-    """A robot with noise that its fan is not, as loud as ten fans and of their colour; the scorer of it, and that noise as a model says it."""
+    """A robot with noise that its fan is not, as loud as ten fans and of their colour; that recording, and that noise as a model says it."""
     x, robot = voice(6.0), profile()
     noise = np.random.default_rng(7).standard_normal(x.size) * np.sqrt(9.0 * total_power(robot.noise_psd))
     prepared = prepare(robot, (record(x) + noise).astype(np.float32), x)
     prepared = replace(prepared, measurement=replace(prepared.measurement, noise_psd=robot.noise_psd), ordinary=())
     psd = robot.noise_psd.astype(float)
     variance = np.full(x.size, 9.0 * total_power(robot.noise_psd), np.float32)
-    return Scorer(prepared), prepared.model, variance, psd / (np.sum(psd) * 8000 / (psd.size - 1))
+    return prepared, prepared.model, variance, psd / (np.sum(psd) * 8000 / (psd.size - 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,9 +36,9 @@ class Noisy(EchoModel):
 
 
 def scored(noisy, times):
-    scorer, model, variance, colour = noisy
+    recording, model, variance, colour = noisy
     sources = ((times * variance, colour),) if times else ()
-    return scorer.of(Noisy(model.impulse_response, sources=sources))
+    return recording.of(Noisy(model.impulse_response, sources=sources))
 
 
 def test_noise_that_is_there_explains_and_more_or_less_of_it_explains_less(noisy):
@@ -65,8 +61,8 @@ def test_another_fan_is_paid_or_charged_half_of_its_decibels(louder_db, gain_db)
     fan = 10 ** (louder_db / 20) * record(0.0 * x)
     prepared = prepare(robot, record(x) - record(0.0 * x) + fan, x)
     prepared = replace(prepared, measurement=replace(prepared.measurement, noise_psd=robot.noise_psd))
-    scorer, changed = Scorer(prepared), prepared.model.with_effect("fan_noise", {"spectrum_db": louder_db})
-    before, after = scorer.of(prepared.model), scorer.of(changed)
+    recording, changed = prepared, prepared.model.with_effect("fan_noise", {"spectrum_db": louder_db})
+    before, after = recording.of(prepared.model), recording.of(changed)
     assert after.over_db == pytest.approx(0.0, abs=0.3) and after.silent_db == pytest.approx(0.0, abs=0.3)
     assert before.silent_db == pytest.approx(louder_db, abs=0.3)
     assert before.level_db - after.level_db == pytest.approx(gain_db, abs=0.3)
@@ -77,22 +73,9 @@ def test_a_gain_behind_the_microphone_is_expected_on_the_fan_as_well():
     gain = 10 ** (np.interp(np.arange(x.size), [0, x.size], [6.0, -12.0]) / 20).astype(np.float32)
     prepared = prepare(robot, gain * record(x), x)
     curve = np.interp(np.arange(0.0, 6.1, 0.25), [0.0, 6.0], [6.0, -12.0])
-    model, scorer = prepared.model.with_effect("mic_agc", {"gain_db": curve}), Scorer(prepared)
+    model, recording = prepared.model.with_effect("mic_agc", {"gain_db": curve}), prepared
     turned = model.passed(np.ones(x.size, np.float32), x)
     assert turned == pytest.approx(gain, rel=0.02)
-    score = scorer.of(model)
+    score = recording.of(model)
     assert np.ptp(10 * np.log10(score.cells.mean(axis=1))) < 3.0 and abs(score.over_db) < 0.5
-    assert score.level_db < scorer.of(prepared.model).level_db - 2.0
-
-
-@pytest.mark.slow
-def test_a_run_that_meets_an_earlier_one_ends_there():
-    x, robot = voice(6.0), profile()
-    changed = robot.echo.with_effect("playback_gain", {"gain_db": -4.0}).with_effect("clock_drift", {"ppm": 40.0})
-    prepared = prepare(robot, record(x, changed), x)
-    bench, start = Workbench(prepared, Criteria()), prepared.model
-    known = set()
-    for name, others in (("clock_drift", {"playback_gain"}), ("playback_gain", set())):
-        *_, run = _stepwise(bench, start, bench.attempt(name, start), known)
-        assert set(added(start, run)) == {name} | others
-    assert frozenset({"clock_drift", "playback_gain"}) in known
+    assert score.level_db < recording.of(prepared.model).level_db - 2.0
