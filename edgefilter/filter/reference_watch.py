@@ -229,10 +229,8 @@ class ReferenceWatch:
             self._stage = 2
             self._search.listen({0: self._mic}, now, self._looked)
         elif stage == 2:
-            found = self._search.find()
-            self._looked = now + min(
-                found.lag if found else 0, 0
-            )  # at that lag the next look hears what this one did not
+            found = self._search.find() or Found(0, 0.0, now)  # a silent microphone does not show the robot either
+            self._looked = now + min(found.lag, 0)  # at that lag the next look hears what this one did not
         elif self._onsets.active and now >= self._next:
             self._next, self._stage = now + LATEST, 1
             self._search.prepare(self._ref, now, now - self._search.span)
