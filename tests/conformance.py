@@ -222,14 +222,14 @@ def fan(n: int, seed: int = 2) -> np.ndarray:
 def robot_alone(
     name: str | None = None, values: Mapping[str, object] | None = None, gain_db: float = 0.05
 ) -> tuple[Measurement, EchoModel]:
-    """A recording with that effect, the fan, a gain that is a little off and a faint cubic distortion.
+    """A recording with that effect, the fan as it lets that through, a gain that is a little off and a faint cubic distortion.
 
     And the model without the effect.
     """
     x, model = robot_speech(), robot_model()
     truth = model.with_effect(name, values) if name else model
     drive = x - np.float32(0.005) * x**3
-    noise = changed_fan(name, values or {}, x.size) + unpredictable(truth, x)
+    noise = truth.passed(changed_fan(name, values or {}, x.size), drive) + unpredictable(truth, x)
     psd = _fan_psd()
     recording = (truth.predict(drive) * np.float32(10 ** (gain_db / 20)) + noise).astype(np.float32)
     return Measurement(x, recording, psd, np.arange(x.size) // 8000 % 2 == 0), model
