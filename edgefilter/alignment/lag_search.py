@@ -26,7 +26,7 @@ _RISE = rise(FADE).astype(np.float32)
 REFLECTIONS, REFLECTED = 320, 0.75
 """Peaks up to 20 ms behind an arrival may be its reflections and count only this much against it."""
 COARSE = 32
-"""Samples over which the energies that lags let overlap are summed."""
+"""Lags that share one normalisation: the energy of what overlaps is summed up in steps of so many samples."""
 NEAR, ASIDE = 12, 512
 """Lags on each side of a peak that belong to it, and lags on each side of the one found over which `before` correlates the
 earlier window."""

@@ -35,7 +35,7 @@ class Criteria:
     """Complexity of long filters: half a minute does not teach all their taps, so what they leave of the samples fitted
     to says little."""
     most_effects: int = 3
-    """A bound on the work: what the search is checked on holds two at once, and a third to be taken back."""
+    """Most effects that a search adds, a bound on its time: the recordings it was tested on have two, and it may add one that it drops again."""
     little_db: float = 2.0
     """Over the silences, and with next to nothing of the power over the fan, no last resort is tried: the model of the right
     effect leaves as much."""

@@ -56,7 +56,7 @@ class Law:
     values: Values = field(repr=False)
 
     def file(self, name: str) -> str:
-        """The text of a Python file that defines an effect of that name."""
+        """The text of a Python file that defines this law as an effect called `name`."""
         known = ((key, value) for key, value in self.values.items() if not _given(self.effect, key))
         return FILE.format(
             title=f"{self.family[:1].upper()}{self.family[1:]}",

@@ -31,7 +31,7 @@ STEP = HOP * FRAMES_PER_CELL
 SPAN = STEP - HOP + FRAME
 """Samples of one cell."""
 FEWEST = round(BLOCK / STEP)
-"""Cells, half a second of them, that tell of what the robot's silences are."""
+"""Least number of cells without the robot, half a second, from which the level of its silences is read."""
 TOLERANCE = 0.012
 """An ordinary robot's path differs from its calibration by this share at each frequency (0.1 dB, 0.7 degrees)."""
 TOLERANCE_TAPS = 32

@@ -176,7 +176,7 @@ def _left_without(bench: Workbench, start: EchoModel, model: EchoModel, name: st
 
 
 def _steps(bench: Workbench, start: EchoModel, model: EchoModel, order: Sequence[str]) -> tuple[Trial, ...]:
-    """The effects of a model beyond the start in that order."""
+    """The effects that a model has and the start has not, in the order given, each with what it explains beside those before it."""
     steps, values = [], dict(model.effects)
     for name in order:
         grown = start.with_effect(name, values[name])

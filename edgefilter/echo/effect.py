@@ -122,7 +122,7 @@ class Effect:
         return np.zeros(reference.size, np.float32)
 
     def colour(self, values: Values) -> Array:
-        """The spectral density of that, (601,) or (k, 601), 0 to 8 kHz, per Hz: its integral is 1. By default white."""
+        """Spectral density per Hz of what `variance` says is added, (601,), 0 to 8 kHz, integral 1; (k, 601) of k such. White by default."""
         return np.full(601, 1.0 / 8000.0)
 
     def passed(self, noise: Samples, voice: Samples, values: Values, sample_rate: int) -> Samples:

@@ -15,7 +15,7 @@ from edgefilter.echo.wiener import convolve_from, fit_filter
 from edgefilter.types import Samples
 
 TAPS, LEAD = 256, 64
-"""Of the filter by which the path may differ, and a band be cut."""
+"""Taps of the filter by which the path may differ from the calibrated one or a codec cuts the band, and those before its centre."""
 SHORT, LONG = (512, 128), (1024, 256)
 """Frame and hop, for what is coherent with the voice and for harmonics."""
 PLACES = ((7, 15), (13, 7), (3, 41))

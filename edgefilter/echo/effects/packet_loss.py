@@ -25,8 +25,8 @@ TAPS, SPREAD = 640, 600
 BLOCK = STEP * min(LENGTHS)
 """Samples of the shortest frame."""
 LOUD, MISSING, PREDICTED = 30.0, 0.5, 0.1
-"""Of the voice over the fan where a block says something; what is left of a block that is missing, of the voice there; and
-what is left at most of half of the blocks where the voice is predicted at all."""
+"""Ratios of power. A block counts where the voice is LOUD times the fan. It is missing where the residual is more than MISSING of
+the voice predicted there. That is only asked where in half of the blocks the residual is less than PREDICTED of it."""
 CLEAR, SURE = 100.0, 25.0
 """Energy of a frame over the variance of the residual where it says something, and by which it must fall without the frame."""
 FEWEST, OFF_GRID = 4, 0.9

@@ -143,7 +143,11 @@ def _bent(x: Samples, scale: float) -> Samples:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Driver (setting: its resonance) or amplifier: where it bends, its terms at the microphone (used, k), what is left with them."""
+    """A nonlinear driver or amplifier as fitted.
+
+    setting: the driver's resonance in Hz. scale: level at which it becomes nonlinear. columns: (samples used, k), its k terms
+    at the microphone. left: what of the recording they leave.
+    """
 
     setting: float
     scale: float
@@ -296,7 +300,7 @@ class _Halves:
         return (self._linear @ taps.astype(np.float32))[self.used] * self._root[:, 0]
 
     def _normal(self, columns: Sequence[Samples]) -> list[Array]:
-        """Of each half the weighted products of linear voice, columns and target with each other."""
+        """For each half of the samples used, the normal equations: weighted products of the linear voice, the columns and the target."""
         size = NUISANCE_TAPS + sum(each.shape[1] for each in columns) + 1
         halves = [np.zeros((size, size)), np.zeros((size, size))]
         edges = (0, self._split, self.used.size)
