@@ -90,7 +90,11 @@ def models_of(systems: Iterable[str]) -> dict[str, Path]:
     found = {}
     for system in systems:
         for name in engines.HAVE_MODEL:
-            if system == "auto" or system == name or system.startswith((f"{name}-learning", f"{name}-uncalibrated")):
+            if (
+                system == "auto"
+                or system == name
+                or system.startswith(tuple(f"{name}-{way}" for way in ("learning", "uncalibrated", "listen")))
+            ):
                 try:
                     path = engines.create(name).model.path
                 except EdgefilterError:

@@ -1,8 +1,8 @@
 """The one catalogue of systems: what each does with a clip, what it knows, and why one cannot be had here.
 
 A row's name says how an engine runs: `crnn` with the clip's calibration, `crnn-learning` learns while it runs as well,
-`crnn-uncalibrated` and `crnn-uncalibrated-learning` know nothing beforehand. `-true-lag` behind a peer's name: its
-reference is delayed by the true lag, which no robot knows.
+`crnn-uncalibrated` and `crnn-uncalibrated-learning` know nothing beforehand. `crnn-listen`, and so on, is the same engine's
+sound for people. `-true-lag` behind a peer's name: its reference is delayed by the true lag, which no robot knows.
 """
 
 from __future__ import annotations
@@ -30,11 +30,12 @@ from edgefilter.engines import HAVE_MODEL, create
 from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.filter.budget import versions
 from edgefilter.filter.echo_path import FilteredHop, Learner, Lesson, PathState
-from edgefilter.types import SAMPLE_RATE, Samples
+from edgefilter.types import SAMPLE_RATE, Samples, SoundFor
 
 OWN = ("linear", "ss", "crnn")
 WAYS = {"": "calibrated", "-learning": "calibrated and learning", "-uncalibrated-learning": "learning only",
         "-uncalibrated": "uncalibrated"}  # fmt: skip
+LISTEN = "-listen"
 ARRAYS = (2, 3, 4)
 """Numbers of microphones, of conversations that have so many."""
 TRUE_LAG = "-true-lag"
@@ -69,7 +70,7 @@ class Output(NamedTuple):
 class System:
     """A row.
 
-    kind: unfiltered, paper, own, peer, bound or detector. knows: what it had besides microphone and reference. latency_ms: from
+    kind: unfiltered, paper, own, listen, peer, bound or detector. knows: what it had besides microphone and reference. latency_ms: from
     its windows, None where it answers only at the end. missing: raises NotHere where it cannot run here. code: files
     and versions on which its output depends. model: a network that no engine brings.
     """
@@ -95,18 +96,25 @@ class Row(NamedTuple):
     engine: str
     calibrated: bool
     learning: bool
+    sound: SoundFor = "recognise"
 
 
 def row(name: str) -> Row:
     base = name.removesuffix("-learning")
-    engine = base.removesuffix("-uncalibrated")
-    return Row(engine, engine == base, base != name)
+    heard = base.removesuffix("-uncalibrated")
+    engine = heard.removesuffix(LISTEN)
+    return Row(engine, heard == base, base != name, "recognise" if engine == heard else "listen")
 
 
 def catalogue(networks: Mapping[str, Path] | None = None) -> dict[str, System]:
     """All rows by name, in the order of the tables. networks: further networks for the engine crnn, by name."""
     rows = [System("unfiltered", "Unfiltered", "unfiltered", lambda clip: Output(clip.mic), latency_ms=0.0)]
-    rows += [*_paper(), *(_own(engine, way) for way in WAYS for engine in OWN), *_arrays(), *_peers()]
+    rows += [
+        *_paper(),
+        *(_own(engine, way) for way in WAYS for engine in (*OWN, f"crnn{LISTEN}")),
+        *_arrays(),
+        *_peers(),
+    ]
     rows += [_own("crnn", "", path, f"crnn:{name}") for name, path in (networks or {}).items()]
     rows += _bounds()
     rows += [
@@ -122,12 +130,12 @@ def catalogue(networks: Mapping[str, Path] | None = None) -> dict[str, System]:
 
 
 def chosen(names: Sequence[str], networks: Mapping[str, Path] | None = None) -> list[System]:
-    """The rows of these names; without any, all but the detectors. Raises UsageError for a name that no row has."""
+    """The rows of these names; without any, all but detectors and sounds for people. Raises UsageError for a name that no row has."""
     rows = catalogue(networks)
     for name in names:
         if name not in rows:
             raise UsageError(f"unknown system '{name}': choose some of {', '.join(rows)}")
-    return [one for one in rows.values() if one.name in names or (not names and one.kind != "detector")]
+    return [one for one in rows.values() if one.name in names or (not names and one.kind not in ("detector", "listen"))]
 
 
 def present(rows: Iterable[System]) -> tuple[list[System], dict[str, str]]:
@@ -146,7 +154,7 @@ def run_engine(
     wanted: Row, signals: Signals, profile: Profile | None, learner: Learner | None = None, model: Path | None = None
 ) -> Output:
     """An engine over mic and ref, hop by hop as live, so that its events and the probability after each hop are known."""
-    ego = EgoFilter(profile, wanted.engine, model=model, learn=learner)
+    ego = EgoFilter(profile, wanted.engine, model=model, learn=learner, output=wanted.sound)
     parts, probability = [], []
     for at in range(0, signals.ref.size, ego.hop):
         parts.append(ego.process(signals.mic[at : at + ego.hop], signals.ref[at : at + ego.hop]))
@@ -160,7 +168,7 @@ def run_engine(
 def _own(engine: str, way: str, model: Path | None = None, name: str = "", title: str = "", train: str = "") -> System:
     """A row of an engine of the package. title: of a row of the source paper. train: what makes a model that is missing."""
     wanted = row(engine + way)
-    kind = "paper" if title else "own"
+    kind = "paper" if title else "own" if wanted.sound == "recognise" else "listen"
     must = wanted.calibrated and (model is None or kind == "paper")
 
     def run(clip: Clip) -> Output:
@@ -173,12 +181,12 @@ def _own(engine: str, way: str, model: Path | None = None, name: str = "", title
     def missing() -> object:
         if model and not model.is_file():
             raise NotHere(f"no {model.name} in {model.parent.name}/" + (f": train one with {train}" if train else ""))
-        return create(engine, model=model) if engine in HAVE_MODEL else None
+        return create(wanted.engine, model=model) if wanted.engine in HAVE_MODEL else None
 
     knows = WAYS[way] if wanted.learning else "calibration" if wanted.calibrated else "neither"
     title = title or (f"{engine} with network {name.partition(':')[2]}" if model else f"{engine}, {WAYS[way]}")
-    late = None if engine == "paper-crnn" else _latency_ms(engine)  # whole clips
-    code = partial(_engine_code, engine, model)
+    late = None if engine == "paper-crnn" else _latency_ms(wanted.engine)  # whole clips
+    code = partial(_engine_code, wanted.engine, model)
     return System(name or engine + way, title, kind, run, knows, late, missing, code, model)
 
 

@@ -307,6 +307,15 @@ def test_engines_that_tell_who_speaks_have_events_and_others_none(pairs: Path) -
     )
 
 
+def test_the_sound_for_people_is_a_row_of_its_own_for_who_asks(pairs: Path) -> None:
+    (clip,) = named([recorded_clip(one) for one in find_recordings(pairs) if one.name == "device1_00"], "alone")
+    known = systems.catalogue()
+    heard, listened = (known[f"crnn{sound}-uncalibrated"].run(clip) for sound in ("", "-listen"))
+    assert (known["crnn-listen"].knows, known["crnn-listen-uncalibrated"].knows) == ("calibration", "neither")
+    assert np.mean(listened.samples**2) < np.mean(heard.samples**2) and listened.probability == heard.probability
+    assert "crnn" in (every := [one.name for one in systems.chosen([])]) and "crnn-listen" not in every
+
+
 @pytest.mark.slow
 def test_learning_rows_share_what_was_learned_and_say_what_they_know(live: Path, tmp_path: Path) -> None:
     begun = shutil.copytree(live / "lab_00", tmp_path / "begun" / "lab_00")
