@@ -79,10 +79,10 @@ def test_a_model_that_answers_a_probability_beyond_0_to_1_is_held_to_them(tmp_pa
     assert engine.step(heard, engine.initial_state())[0].speech_probability == told
 
 
-def test_the_answer_is_unexplained_where_the_error_is_four_times_what_noise_and_residual_echo_lead_to_expect():
+def test_the_answer_is_unexplained_where_the_error_is_8_dB_over_what_noise_and_residual_echo_lead_to_expect():
     engine, rng = Crnn(EDGE), np.random.default_rng(2)
     *others, error = (spectrum(rng, 257) for _ in range(4))
-    nothing, part, power = np.zeros(257, np.float32), np.float32(0.2), np.abs(error) ** 2
+    nothing, part, power = np.zeros(257, np.float32), np.float32(0.12), np.abs(error) ** 2
 
     def told(noise, residual):
         answer = engine.step(Frame(*others, error, noise, residual), engine.initial_state())[0]

@@ -72,7 +72,7 @@ class MicAgc(Effect):
         """Penalised least squares of the gain at the knots, from the voice where it sounds.
 
         A smoothing spline of first order (Eilers & Marx 1996, with second differences), which bridges what is not fitted.
-        Neutral where the fan does not move with it.
+        Neutral where it does not move, or the fan does not move with it.
         """
         predicted = measurement.predicted(model)[1]
         recording = measurement.white_recording
@@ -86,9 +86,8 @@ class MicAgc(Effect):
         matrix = (parts * energy) @ parts.T + bends.T @ bends + 1e-6 * np.eye(count)
         knots = np.linalg.solve(matrix, parts @ cross + 1e-6)
         gain = np.interp(np.arange(voice.size) * (KNOTS_HZ / SAMPLE_RATE), np.arange(knots.size), knots)
-        if not _pays(gain, voice, recording, measurement):
-            return within(self, {"gain_db": 20.0 * np.log10(overall), "range_db": 0.0, "time_constant_s": 0.0})
-        if not _fan_moves(gain * overall, recording - gain * voice, measurement):
+        pays = _pays(gain, voice, recording, measurement)
+        if not pays or not _fan_moves(gain * overall, recording - gain * voice, measurement):
             return neutral(self)
         curve = 20.0 * np.log10(np.clip(knots * overall, 1e-3, 1e3))
         low, high = np.percentile(curve, [5, 95])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from edgefilter.echo.effect import complete
+from edgefilter.echo.effect import complete, neutral
 from edgefilter.echo.effects import catalogue
 from tests.conformance import fan, robot_alone
 
@@ -67,11 +67,11 @@ def test_gain_control_at_a_step_between_knots_is_linear_in_db():
     np.testing.assert_allclose(20 * np.log10(out[[0, 1000, 2000, 4000, 7999]]), [0.0, 1.5, 3.0, 6.0, 6.0], atol=1e-3)
 
 
-def test_a_constant_gain_is_one_number_without_range():
-    found = catalogue.find("mic_agc").fit(*robot_alone("playback_gain", {"gain_db": -2.0}))
-    assert (
-        np.ndim(found["gain_db"]) == 0 and found["gain_db"] == pytest.approx(-2.0, abs=0.2) and found["range_db"] == 0.0
-    )
+def test_a_gain_that_stands_still_is_no_gain_control_but_the_volume():
+    measurement, model = robot_alone("playback_gain", {"gain_db": -2.0})
+    agc, volume = map(catalogue.find, ("mic_agc", "playback_gain"))
+    assert agc.fit(measurement, model) == neutral(agc)
+    assert volume.fit(measurement, model)["gain_db"] == pytest.approx(-2.0, abs=0.2)
 
 
 def test_fan_that_is_louder_in_a_band_is_found_in_that_band():
