@@ -442,9 +442,13 @@ def main(argv: list[str] | None = None) -> int:
         # a pipe gets each line at once; a file name that the terminal's encoding lacks is no reason to stop
         sys.stdout.reconfigure(line_buffering=True, errors="backslashreplace")
     try:
-        with on_signal(_interrupt), nullcontext() if debug else own_words_only():
-            code = _call(arguments)
-            sys.stdout.flush()  # what is still buffered fails here, with a reason, or at exit, with a traceback
+        with on_signal(_interrupt) as caught, nullcontext() if debug else own_words_only():
+            try:
+                code = _call(arguments)
+                sys.stdout.flush()  # what is still buffered fails here, with a reason, or at exit, with a traceback
+            finally:
+                if caught:  # also where a library has turned KeyboardInterrupt into an error of its own
+                    raise KeyboardInterrupt
         return code
     except UsageError as error:
         return _fail(error, 2, debug)

@@ -20,6 +20,8 @@ from edgefilter.types import SAMPLE_RATE
 try:
     import onnxruntime
 except Exception as error:  # a broken installation raises what its binary part does: ImportError, OSError
+    if isinstance(error.__cause__, KeyboardInterrupt):
+        raise error.__cause__ from None
     said = " ".join(f"{type(error).__name__}: {error}".split())[:160]
     raise ModelError(f"onnxruntime cannot be loaded ({said}): pip install --force-reinstall onnxruntime") from None
 

@@ -14,6 +14,9 @@ import numpy as np
 import pytest
 import soundfile
 
+from edgefilter.cli import main
+from edgefilter.commands import doctor
+from edgefilter.errors import ModelError
 from tests.commands.program import here
 from tests.diagnosis.robot_scene import profile, record, voice
 
@@ -254,6 +257,17 @@ def test_a_second_signal_ends_a_run_whose_reader_does_not_read(folder):
     finally:
         child.kill()
         child.wait()
+
+
+def test_an_interrupt_counts_also_where_a_library_makes_an_import_error_of_it(monkeypatch, capsys):
+    def swallow(args):
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt as interrupt:
+            raise ModelError("initialization failed") from interrupt
+
+    monkeypatch.setattr(doctor, "main", swallow)
+    assert main(["doctor"]) == 130 and capsys.readouterr().err == "edgefilter: interrupted\n"
 
 
 @pytest.mark.slow
