@@ -120,7 +120,8 @@ class Residual:
         """
         self._echo *= TAIL_DECAY
         np.maximum(fourier.power(echo), self._echo, out=self._echo)
-        noise = self._tracked.step(fourier.power(error))
+        observed = fourier.power(error)
+        noise = self._tracked.step(observed)
         if fan is not None:
             noise = fan
         elif self._calibrated is not None:
@@ -140,7 +141,7 @@ class Residual:
         brought += unknown
         self._loudest = max(loud, WITH_VOICE_HELD * self._loudest)
         if self.nobody_speaks and self._loudest > AUDIBLE * noise_power:
-            self._follow(fourier.power(error) - noise - brought)
+            self._follow(observed - noise - brought)
         brought += np.float32(WITH_VOICE_MARGIN * self._loudest) * np.maximum(self._with_voice, np.float32(0.0))
         return noise, brought
 
