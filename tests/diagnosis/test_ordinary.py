@@ -64,7 +64,7 @@ def test_an_effect_that_is_not_in_the_table_is_held_against_the_one_that_explain
 def test_the_table_that_comes_along_knows_every_effect_and_the_default_rate_lets_clear_ones_through():
     for name in names():
         assert p_value(name, 0.0) == 1.0 and p_value(name, 3.0) <= Criteria.false_rate
-        assert p_value(name, 1e-4) > Criteria.false_rate or name in ("clock_drift",)
+        assert p_value(name, 1e-4) > Criteria.false_rate
 
 
 def test_people_read_percent():
