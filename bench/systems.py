@@ -154,7 +154,7 @@ def run_engine(
     wanted: Row, signals: Signals, profile: Profile | None, learner: Learner | None = None, model: Path | None = None
 ) -> Output:
     """An engine over mic and ref, hop by hop as live, so that its events and the probability after each hop are known."""
-    ego = EgoFilter(profile, wanted.engine, model=model, learn=learner, output=wanted.sound)
+    ego = EgoFilter(profile, engine=wanted.engine, model=model, learn=learner, output=wanted.sound)
     parts, probability = [], []
     for at in range(0, signals.ref.size, ego.hop):
         parts.append(ego.process(signals.mic[at : at + ego.hop], signals.ref[at : at + ego.hop]))

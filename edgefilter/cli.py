@@ -10,6 +10,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, get_args
 
@@ -442,13 +443,15 @@ def main(argv: list[str] | None = None) -> int:
         # a pipe gets each line at once; a file name that the terminal's encoding lacks is no reason to stop
         sys.stdout.reconfigure(line_buffering=True, errors="backslashreplace")
     try:
-        with on_signal(_interrupt) as caught, nullcontext() if debug else own_words_only():
-            try:
-                code = _call(arguments)
-                sys.stdout.flush()  # what is still buffered fails here, with a reason, or at exit, with a traceback
-            finally:
-                if caught:  # also where a library has turned KeyboardInterrupt into an error of its own
-                    raise KeyboardInterrupt
+        with nullcontext() if debug else own_words_only():
+            command = _load(arguments)  # with the handlers of __main__: an import may swallow KeyboardInterrupt
+            with on_signal(_interrupt) as caught:
+                try:
+                    code = command() or 0
+                    sys.stdout.flush()  # what is still buffered fails here, with a reason, or at exit, with a traceback
+                finally:
+                    if caught:  # also where a library has turned KeyboardInterrupt into an error of its own
+                        raise KeyboardInterrupt
         return code
     except UsageError as error:
         return _fail(error, 2, debug)
@@ -465,16 +468,16 @@ def main(argv: list[str] | None = None) -> int:
         return _fail(f"{error.filename or 'system'}: {error.strerror or error}", 1, debug)
 
 
-def _call(arguments: list[str]) -> int:
+def _load(arguments: list[str]) -> Callable[[], int | None]:
+    """The command that was asked for, with all that it imports."""
     parser = build_parser()
     args = parser.parse_args(arguments)
     if args.command is None:
-        parser.print_help()
-        return 0
+        return parser.print_help
     check_outputs(args)
     for file in getattr(args, "effects", []):
         load_effect(file)
-    return importlib.import_module(f"edgefilter.commands.{args.command}").main(args) or 0
+    return partial(importlib.import_module(f"edgefilter.commands.{args.command}").main, args)
 
 
 def _interrupt() -> NoReturn:

@@ -25,6 +25,23 @@ from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Frame
 MakeStream = Callable[[], Stream]
 
 
+def robot() -> Profile:
+    """A profile that fits conversation: direct sound and a short decaying tail."""
+    rng = np.random.default_rng(0)
+    response = np.zeros(2048, np.float32)
+    response[PRE_ROLL : PRE_ROLL + 600] = 0.1 * rng.standard_normal(600) * np.exp(-np.arange(600) / 120)
+    response[PRE_ROLL] = 0.6
+    return Profile(
+        echo=EchoModel(response),
+        delay=900.0,
+        response=np.full(601, 0.6, np.float32),
+        noise_psd=np.full(601, 1e-10, np.float32),
+        band_hz=np.array([[100.0, 8000.0]]),
+        band_snr_db=np.array([40.0]),
+        distortion_db=np.full(4, -40.0),
+    )
+
+
 def conversation(n: int = 24_000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """A robot-like reference in bursts, its echo 900 samples later with a decaying tail, a weak human and a fan.
 
@@ -364,7 +381,9 @@ def effect_check_lowers_what_the_running_filter_leaves_or_says_why_not(name: str
     )
     mic, ref, profile = running_robot(name, values)
     knowing = profile.with_echo(profile.echo.with_effect(name, values))
-    without, with_it = (enhance(mic, ref, known, "ss")[SAMPLE_RATE // 4 : SAMPLE_RATE] for known in (profile, knowing))
+    without, with_it = (
+        enhance(mic, ref, known, engine="ss")[SAMPLE_RATE // 4 : SAMPLE_RATE] for known in (profile, knowing)
+    )
     if np.allclose(without, with_it, rtol=0.0, atol=1e-6):  # the last bits of a float32
         assert "changes nothing" in reach(effect, values)
         return

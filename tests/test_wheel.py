@@ -18,6 +18,7 @@ ROOT = Path(__file__).parents[1]
 BELONGINGS = ("edgefilter", "models", "pyproject.toml", "README.md", "LICENSE", "NOTICE")
 NOT_CODE = {
     "edgefilter/py.typed",
+    "edgefilter/__init__.pyi",
     "edgefilter/demo_data/LICENSE.md",
     "edgefilter/demo_data/human.flac",
     *(
@@ -32,7 +33,7 @@ NOT_CODE = {
     "edgefilter/models/MODELS.md",
     "edgefilter/models/crnn_int8.onnx",
 }
-"""All that is neither Python nor a part of the report's page: the demo's recordings, the network, their licences, and what the
+"""All that is neither Python nor a part of the report's page: the public names, the demo's recordings, the network, their licences, and what the
 diagnosis finds by chance."""
 
 
@@ -79,7 +80,7 @@ def test_the_wheel_holds_every_module_and_nothing_that_is_not_read(wheel):
 
 def test_each_core_dependency_is_bound_below_and_below_its_next_major_version_and_the_bounds_hold_here():
     stated = re.search(r"^dependencies = \[(.*?)^\]", (ROOT / "pyproject.toml").read_text(), re.S | re.M)[1]
-    found = re.findall(r'"([a-z]+)>=([\d.]+),<(\d+)"', stated)
+    found = re.findall(r'"([a-z-]+)>=([\d.]+),<(\d+)"', stated)
     assert len(found) == len(re.findall('"', stated)) // 2 >= 7
     for name, least, below in found:
         here = tuple(int(part) for part in metadata.version(name).split(".")[:3])

@@ -41,7 +41,7 @@ SETTLE, EDGE = RATE, RATE // 5
 def score(scene: EffectConversation, profile: Profile, engine: str) -> dict[str, float]:
     """SI-SDR over the human and ERLE over the robot alone, dB, of the filter started after the early part."""
     mic, ref = scene.mic[scene.early :], scene.ref[scene.early :]
-    out = enhance(mic, ref, profile, engine)
+    out = enhance(mic, ref, profile, engine=engine)
     span = slice(scene.human.start - scene.early, scene.human.stop - scene.early)
     alone = slice(SETTLE, span.start - EDGE)
     return {"si_sdr": si_sdr(out[span], scene.clean[scene.human]), "erle": erle(mic[alone], out[alone])}

@@ -99,7 +99,7 @@ def check_output(mic: np.ndarray, out: np.ndarray) -> None:
 
 def filter_with(profile: Profile, engine: str, learn: bool) -> None:
     mic, ref = sound()
-    ego = EgoFilter(profile, engine, learn=PathLearner(profile) if learn else None)
+    ego = EgoFilter(profile, engine=engine, learn=PathLearner(profile) if learn else None)
     check_output(mic, np.concatenate((ego.process(mic, ref), ego.flush())))
     json.dumps(ego.stats(), allow_nan=False)
 

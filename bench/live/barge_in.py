@@ -83,7 +83,7 @@ SHORT = {"word": "a word of 0.3-0.5 s", "cough": "a cough"}
 
 
 def listen(mic: Samples, ref: Samples, profile: Profile | None, engine: str) -> Output:
-    ego, probability, done = EgoFilter(profile, engine), [], []
+    ego, probability, done = EgoFilter(profile, engine=engine), [], []
     mic, ref = mic.astype(np.float32), ref.astype(np.float32)
     for at in range(0, mic.size, ego.hop):
         done.append(ego.process(mic[at : at + ego.hop], ref[at : at + ego.hop]))

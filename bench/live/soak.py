@@ -110,7 +110,7 @@ def blocks(total: int, one_way: bool = False) -> Iterator[tuple[np.ndarray, np.n
 
 def from_file(minutes: float, engine: str, one_way: bool = False) -> dict:
     """So many minutes of audio through the whole path as fast as it goes."""
-    ego, yardstick = EgoFilter(DEMO / "profile.npz", engine), EgoFilter(engine="bypass")
+    ego, yardstick = EgoFilter(DEMO / "profile.npz", engine=engine), EgoFilter(engine="bypass")
     total, done, out, not_finite = round(60 * minutes * SAMPLE_RATE), 0, 0, 0
     took, bypassed, slices = [], [], []
     for number, (mic, ref) in enumerate(blocks(total, one_way)):

@@ -21,7 +21,7 @@ def pcm16(samples):
 
 mic_path, reference_path, *profile = sys.argv[1:]
 mic, reference = (soundfile.read(path, dtype="float32")[0] for path in (mic_path, reference_path))
-ego = EgoFilter(profile[0] if profile else None, "crnn", barge_in=BargeInSettings(min_silence_s=0.2))
+ego = EgoFilter(profile[0] if profile else None, engine="crnn", barge_in=BargeInSettings(min_silence_s=0.2))
 classifier, asked = LocalSmartTurnAnalyzerV3(), False
 classifier.set_sample_rate(SAMPLE_RATE)
 for at in range(0, min(mic.size, reference.size) - ego.hop + 1, ego.hop):

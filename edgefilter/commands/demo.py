@@ -46,7 +46,7 @@ def _filter(args: argparse.Namespace) -> None:
     folder = Path(args.output)
     folder.mkdir(parents=True, exist_ok=True)
     with progress("demo: filtering the bundled conversation") as step:
-        ego = EgoFilter(DEMO / "profile.npz", args.engine)
+        ego = EgoFilter(DEMO / "profile.npz", engine=args.engine)
         output = folder / "filtered.wav"
         with FileSource(DEMO / "mic.flac", DEMO / "reference.flac") as source, FileSink(output) as sink:
             report = filter_blocks(source, ego, sink, due=False)
@@ -55,7 +55,9 @@ def _filter(args: argparse.Namespace) -> None:
         step("again without the robot's calibration")
         mic, reference, human = (_read(DEMO / f"{name}.flac") for name in ("mic", "reference", "human"))
         filtered = _read(output)
-        cold = None if args.engine in NEEDS_PROFILE else _si_sdr(enhance(mic, reference, None, args.engine), human)
+        cold = (
+            None if args.engine in NEEDS_PROFILE else _si_sdr(enhance(mic, reference, None, engine=args.engine), human)
+        )
         figures = report.to_dict() | {
             "si_sdr_before_db": _si_sdr(mic, human),
             "si_sdr_after_db": _si_sdr(filtered, human),
@@ -149,7 +151,7 @@ def _mend(name: str, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     with progress(f"robot {name}: conversation") as step:
         for kept, profile, which in (("before", case.profile, "old"), ("after", applied.profile, "mended")):
             step(f"filtering with the {which} profile")
-            filtered[kept] = enhance(case.talk, case.talk_reference, profile, args.engine)
+            filtered[kept] = enhance(case.talk, case.talk_reference, profile, engine=args.engine)
             write_file(folder / f"human_{kept}.wav", filtered[kept])
         step("drawing the page and the picture")
         drawn = _draw_mended(folder, case, applied, filtered)

@@ -38,7 +38,9 @@ def _node(args: argparse.Namespace) -> None:
     if args.domain is None and not named.isdecimal():
         raise UsageError(f"ROS_DOMAIN_ID is '{named}', expected a number: set it, or give --domain")
     domain = int(named) if args.domain is None else args.domain
-    ego = EgoFilter(args.profile, args.engine, barge_in=BargeInSettings(judge="network", confirm_s=args.confirm_s))
+    ego = EgoFilter(
+        args.profile, engine=args.engine, barge_in=BargeInSettings(judge="network", confirm_s=args.confirm_s)
+    )
     names = args.mic, args.reference, args.silenced, args.human
     wanted = range(args.channels) if args.mic_channels == ALL_CHANNELS else args.mic_channels
     topics = Topics(*names, args.rate, args.channels, wanted, args.reference_channels, args.reference_channel)

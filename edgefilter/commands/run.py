@@ -191,13 +191,21 @@ def make_filter(args: argparse.Namespace, live: bool, profile: Profile | None) -
     """
     if args.remeasure:
         forget()
-    choice, engine, reason, budget_ms = None, args.engine, "asked for", args.budget_ms
+    choice, engine, budget_ms = None, args.engine, args.budget_ms
     if engine == "auto" and not args.model and (live or budget_ms):
         choice = choose(budget_ms or DEFAULT_MS, profile, say=say)
-        engine, reason, budget_ms = choice.engine, choice.reason, choice.budget_ms
-    learner = make_learner(args, live, profile)
-    budget_ms, barge_in = budget_ms if live else None, BargeInSettings(confirm_s=args.confirm_s)
-    ego = EgoFilter(profile, engine, budget_ms, reason, args.model, barge_in, learner, output=args.sound)
+        engine, budget_ms = choice.engine, choice.budget_ms
+    ego = EgoFilter(
+        profile,
+        engine=engine,
+        budget_ms=budget_ms if live else None,
+        model=args.model,
+        barge_in=BargeInSettings(confirm_s=args.confirm_s),
+        learn=make_learner(args, live, profile),
+        output=args.sound,
+    )
+    if choice:
+        ego.engine_reason = choice.reason
     if profile is None and ego.engine_name in HAVE_LINEAR_STAGE:
         say(
             "no profile: the robot is not calibrated, loudspeaker and room are learned from its first seconds"

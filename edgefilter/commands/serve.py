@@ -40,7 +40,7 @@ def main(args: argparse.Namespace) -> None:
     def make_filter(learns: bool, output: SoundFor = "recognise") -> EgoFilter:
         learner = BackgroundLearner(profile) if learns else None
         settings = BargeInSettings(judge="network", confirm_s=args.confirm_s)
-        return EgoFilter(profile, args.engine, barge_in=settings, learn=learner, output=output)
+        return EgoFilter(profile, engine=args.engine, barge_in=settings, learn=learner, output=output)
 
     make_filter(False)  # what cannot be made is said now, and what is slow to load is loaded
 

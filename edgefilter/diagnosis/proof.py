@@ -110,7 +110,7 @@ class HeldOut:
         measurement = self._prepared.measurement
         heard = measurement.recording[self.cut :]
         said = np.pad(measurement.reference, (0, AHEAD))[self.cut + AHEAD :]
-        left = enhance(heard, said, profile, "linear")
+        left = enhance(heard, said, profile, engine="linear")
         before, after = (decibels(np.sum(np.square(x[self._tested], dtype=np.float64))) for x in (heard, left))
         return float(before - after)
 

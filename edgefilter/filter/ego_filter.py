@@ -38,8 +38,6 @@ class EgoFilter:
         (see Stepping), and an event says so. Without a budget the engine is never changed and missed deadlines are only
         counted. The budget has no effect with judge="network" in `barge_in`, since only the network judges speech there,
         nor with an engine that waits for the end of the recording; `engine_reason` then says so.
-    reason : str
-        Why an engine that was named was chosen, for `stats`.
     model : str or Path, optional
         The ONNX file that a neural engine, named in `engine`, loads in place of its own.
     barge_in : BargeInSettings, optional
@@ -68,7 +66,7 @@ class EgoFilter:
     profile : Profile or None
         The calibrated robot, loaded.
     engine_reason : str
-        Why this engine.
+        Why this engine; whoever has chosen it may say so here.
 
     Raises
     ------
@@ -99,9 +97,9 @@ class EgoFilter:
     def __init__(
         self,
         profile: Profile | str | Path | None = None,
+        *,
         engine: str = "auto",
         budget_ms: float | None = None,
-        reason: str = "asked for",
         model: str | Path | None = None,
         barge_in: BargeInSettings | None = None,
         learn: Learner | None = None,
@@ -118,7 +116,9 @@ class EgoFilter:
             )
         self.profile = Profile.load(profile) if isinstance(profile, str | Path) else profile
         best, self.engine_reason = (
-            strongest(self.profile) if engine == "auto" else (engines.create(engine, self.profile, model=model), reason)
+            strongest(self.profile)
+            if engine == "auto"
+            else (engines.create(engine, self.profile, model=model), "asked for")
         )
         network_judges = barge_in is not None and barge_in.judge == "network"
         if network_judges:
@@ -378,6 +378,7 @@ def enhance(
     mic: Samples,
     ref: Samples,
     profile: Profile | str | Path | None = None,
+    *,
     engine: str = "auto",
     model: str | Path | None = None,
     learn: Learner | None = None,
@@ -415,5 +416,5 @@ def enhance(
     >>> bool(np.mean(left**2) < 0.01 * np.mean(heard[-16_000:] ** 2))
     True
     """
-    ego = EgoFilter(profile, engine, model=model, learn=learn, output=output)
+    ego = EgoFilter(profile, engine=engine, model=model, learn=learn, output=output)
     return np.concatenate((ego.process(mic, ref), ego.flush()))

@@ -70,6 +70,7 @@ class EchoCanceller:
         self,
         sample_rate: int = SAMPLE_RATE,
         channels: int = 1,
+        *,
         profile: Profile | str | Path | None = None,
         engine: str = "auto",
         mic_channels: Sequence[int] | None = None,
@@ -83,7 +84,7 @@ class EchoCanceller:
         array = named(mic_channels, there=channels)
         self.sample_rate, self.channels = sample_rate, channels
         self._heard = [array] if array else [[number] for number in range(channels)]
-        self._filters = [EgoFilter(profile, engine, output=output) for _ in self._heard]
+        self._filters = [EgoFilter(profile, engine=engine, output=output) for _ in self._heard]
         first = self._filters[0]
         if first.waits_for_end:
             why = "needs the whole recording before it answers: take another engine"

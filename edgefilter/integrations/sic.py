@@ -77,7 +77,7 @@ def _ears(
     if channels < 1:
         raise UsageError(f"channels is {channels}, expected at least 1")
     named(mic_channels, there=channels)
-    ego = EgoFilter(profile, engine, barge_in=BargeInSettings(judge="network", confirm_s=confirm_s))
+    ego = EgoFilter(profile, engine=engine, barge_in=BargeInSettings(judge="network", confirm_s=confirm_s))
     return Duplex(ego, on_event=on_event, mic_channels=mic_channels), channels
 
 

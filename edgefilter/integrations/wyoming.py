@@ -515,7 +515,9 @@ def main(words: list[str] | None = None) -> int:
                     f"{option} {uri} lets other machines listen, and Wyoming knows no password: leave it out, or say --open"
                     " where every machine that reaches it may hear the microphone and speak"
                 )
-        ego = EgoFilter(args.profile, args.engine, barge_in=BargeInSettings(judge="network", confirm_s=args.confirm_s))
+        ego = EgoFilter(
+            args.profile, engine=args.engine, barge_in=BargeInSettings(judge="network", confirm_s=args.confirm_s)
+        )
         mic_format = AudioFormat(args.mic_command_rate, 2, args.mic_command_channels)
         snd_format = AudioFormat(args.snd_command_rate, 2, args.snd_command_channels)
         more = args.stop_for_speech, args.mic_channels, args.recogniser, args.reference_channel

@@ -20,7 +20,7 @@ from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.session import filter_blocks
 from edgefilter.types import ALL_CHANNELS
 from tests.audio.virtual_portaudio import CALLBACK_S, VirtualDevice
-from tests.filter.test_arrays import calibration
+from tests.filter.array_scene import calibration
 
 FOREVER = float("inf")
 STEP = round(CALLBACK_S * 16000)

@@ -326,7 +326,7 @@ def test_learning_rows_share_what_was_learned_and_say_what_they_know(live: Path,
     known = systems.catalogue()
     row = known["linear-learning"]
     assert (row.knows, row.learns, known["linear"].learns) == ("calibrated and learning", True, False)
-    alone = enhance(clip.mic, clip.ref, clip.profile, "linear", learn=PathLearner(clip.profile))
+    alone = enhance(clip.mic, clip.ref, clip.profile, engine="linear", learn=PathLearner(clip.profile))
     np.testing.assert_array_equal(row.run(clip).samples, alone)
     np.testing.assert_array_equal(row.run(clip).samples, alone)  # of lessons that are kept
     assert not np.array_equal(known["linear"].run(clip).samples, alone)
@@ -346,7 +346,7 @@ def test_the_papers_network_filters_what_has_a_calibration_or_says_why_not(
     assert (sizes["filters"], sizes["lstm"], sizes["hidden"]) == ([16] * 7 + [2], 80, 150)  # as its command says
     clip = evaluate.find_clips(options(live, live))[0]
     np.testing.assert_array_equal(
-        row.run(clip).samples, enhance(clip.mic, clip.ref, clip.profile, "paper-crnn", model=row.model)
+        row.run(clip).samples, enhance(clip.mic, clip.ref, clip.profile, engine="paper-crnn", model=row.model)
     )
     clip.source.__dict__["profile"] = None
     with pytest.raises(NotHere, match="no calibration of this device"):

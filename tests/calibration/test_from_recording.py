@@ -122,7 +122,7 @@ def test_a_filter_adapts_from_the_path_made_here_as_fast_as_from_a_learned_one(s
     moved = record(said, EchoModel(path()).with_effect("early_path", {"taps": 0.3 * np.roll(path(), 40)[:300]}))
     heard = np.arange(said.size) > 3 * RATE
     left = {
-        source: np.mean(np.square(enhance(moved, said, replace(alone, source=source), "linear")[heard]))
+        source: np.mean(np.square(enhance(moved, said, replace(alone, source=source), engine="linear")[heard]))
         for source in (alone.source, "")
     }
     assert alone.learned and not replace(alone, source="").learned

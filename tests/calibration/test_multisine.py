@@ -23,7 +23,7 @@ from edgefilter.errors import CalibrationError
 from edgefilter.filter.residual_echo import LEAKAGE, Residual
 from edgefilter.profile.data import GRID_HZ
 from edgefilter.profile.text import describe
-from tests.calibration.test_calibrate import fan, room
+from tests.calibration.robot_room import fan, room
 from tests.diagnosis.robot_scene import voice
 
 FAN_RMS = 3e-4
@@ -220,7 +220,9 @@ def test_ss_leaves_no_more_of_the_robot_than_with_a_sweep_alone(speaker, robot):
     mic = heard_through(room(), speaker.play(said.astype(np.float64)))
     sweep = generate_sweep()
     swept = calibrate(sweep, heard_through(room(), speaker.play(sweep.astype(np.float64))), QUIET)
-    left = [10 * np.log10(np.mean(enhance(mic, said, profile, "ss")[:48_000] ** 2)) for profile in (swept, robot)]
+    left = [
+        10 * np.log10(np.mean(enhance(mic, said, profile, engine="ss")[:48_000] ** 2)) for profile in (swept, robot)
+    ]
     assert left[1] < left[0] + 0.1  # 0.1 dB: the fan differs by as much
 
 

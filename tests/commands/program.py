@@ -1,7 +1,8 @@
-"""The command line in this process: one of its own takes half a second to begin."""
+"""The command line, in this process or in one of its own, which takes half a second to begin."""
 
 import io
 import subprocess
+import sys
 from contextlib import redirect_stderr, redirect_stdout
 
 from edgefilter.cli import main
@@ -13,3 +14,23 @@ def here(*words):
     with redirect_stdout(out), redirect_stderr(error):
         code = main([str(word) for word in words])
     return subprocess.CompletedProcess(words, code, out.getvalue(), error.getvalue())
+
+
+def edgefilter(*arguments, **options):
+    """The program in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-m", "edgefilter.cli", *map(str, arguments)],
+        capture_output=True,
+        timeout=120,
+        **{"text": "input" not in options, **options},
+    )
+
+
+def one_line(result, code, *words):
+    """The run failed with this exit code and one line that holds all words and no traceback."""
+    error = result.stderr if isinstance(result.stderr, str) else result.stderr.decode()
+    lines = [line for line in error.strip().splitlines() if line.startswith("edgefilter:")]
+    assert result.returncode == code, error
+    assert len(lines) == 1 and "Traceback" not in error, error
+    for word in words:
+        assert word in lines[0], lines[0]

@@ -13,29 +13,9 @@ import numpy as np
 import pytest
 import soundfile
 
-from tests.commands.program import here
+from tests.commands.program import edgefilter, here, one_line
 
 RATE = 16000
-
-
-def edgefilter(*arguments, **options):
-    """The program in a process of its own."""
-    return subprocess.run(
-        [sys.executable, "-m", "edgefilter.cli", *map(str, arguments)],
-        capture_output=True,
-        timeout=120,
-        **{"text": "input" not in options, **options},
-    )
-
-
-def one_line(result, code, *words):
-    """The run failed with this exit code and one line that holds all words and no traceback."""
-    error = result.stderr if isinstance(result.stderr, str) else result.stderr.decode()
-    lines = [line for line in error.strip().splitlines() if line.startswith("edgefilter:")]
-    assert result.returncode == code, error
-    assert len(lines) == 1 and "Traceback" not in error, error
-    for word in words:
-        assert word in lines[0], lines[0]
 
 
 @pytest.fixture
@@ -261,7 +241,9 @@ def test_an_interrupted_run_leaves_a_valid_file_with_what_was_received(tmp_path,
     sent = np.full((RATE, 2), 1000, "<i2")
     process.stdin.write(sent.tobytes())
     process.stdin.flush()
-    time.sleep(3)  # the pipe stays open: the program waits for more when the signal comes
+    while sum(file.stat().st_size for file in tmp_path.iterdir()) < RATE:
+        time.sleep(0.1)
+    time.sleep(0.5)  # the pipe stays open: the program waits for more when the signal comes
     process.send_signal(number)
     _, error = process.communicate(timeout=60)
     assert b"Traceback" not in error and process.returncode == 130, error

@@ -64,3 +64,43 @@ def record(x: np.ndarray, model: EchoModel | None = None, lag: float = 0.0, seed
     model = EchoModel(path()) if model is None else model
     clean = model.predict(delayed(x, DELAY - PRE_ROLL + lag))
     return clean + (FAN * np.random.default_rng(seed).standard_normal(x.size)).astype(np.float32)
+
+
+def feedback(x: np.ndarray, ratio: float, threshold_db: float) -> np.ndarray:
+    """A compressor that hears its own output, in steps of 2 ms, 5 ms to come and 100 ms to go."""
+    out, gain_db = np.zeros_like(x), 0.0
+    for at in range(0, x.size, 32):
+        out[at : at + 32] = x[at : at + 32] * 10 ** (gain_db / 20)
+        over = 10 * np.log10(np.mean(out[at : at + 32] ** 2) + 1e-12) - threshold_db
+        wanted = min(-(ratio - 1.0) * over, 0.0)
+        gain_db += (wanted - gain_db) * (0.15 if wanted < gain_db else 0.02)
+    return out
+
+
+def loud_frames(x: np.ndarray, length: int, count: int) -> np.ndarray:
+    """(count,) frames of that length, all in loud parts of the voice, no two of them neighbours."""
+    power = np.mean(x[: x.size // length * length].reshape(-1, length) ** 2, axis=1)
+    candidates = np.flatnonzero(power > 0.3 * power.mean())[2::3]
+    return np.sort(np.random.default_rng(5).permutation(candidates)[:count])
+
+
+def lossy(x: np.ndarray, length: int, fill: float, count: int = 14) -> np.ndarray:
+    out = x.copy()
+    for frame in loud_frames(x, length, count):
+        at = frame * length
+        out[at : at + length] = fill * out[at - length : at]
+    return out
+
+
+def coded(x: np.ndarray, step_db: float = -12.0) -> np.ndarray:
+    """A transform codec: in frames of 20 ms each band is rounded to steps of a part of its own level."""
+    window, out = np.sin(np.pi * (np.arange(640) + 0.5) / 640), np.zeros(x.size + 640)
+    for at in range(0, x.size - 640, 320):
+        spectrum = np.fft.rfft(window * x[at : at + 640])
+        bands = np.array_split(spectrum, 16)
+        steps = [np.sqrt(12 * np.mean(np.abs(band) ** 2) * 10 ** (step_db / 10)) + 1e-12 for band in bands]
+        rounded = [
+            step * (np.round(band.real / step) + 1j * np.round(band.imag / step)) for band, step in zip(bands, steps)
+        ]
+        out[at : at + 640] += window * np.fft.irfft(np.concatenate(rounded))
+    return out[: x.size].astype(np.float32)

@@ -12,8 +12,8 @@ import soundfile
 from edgefilter import Profile, ProfileError, SignalError
 from edgefilter.diagnosis.channels import doubtful_channels, is_clipped
 from edgefilter.types import SAMPLE_RATE
-from tests.commands.test_cli import edgefilter, one_line
-from tests.filter.test_arrays import calibration, fan, noise, talk
+from tests.commands.program import edgefilter, one_line
+from tests.filter.array_scene import PATHS, calibration, fan, noise, talk
 
 
 @pytest.fixture
@@ -82,8 +82,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording of a device of five channels, the robot alone in 1 to 3; the third is turned up by 6 dB."""
     made = tmp_path_factory.mktemp("channels")
     said = np.tile(talk()[1][: 3 * SAMPLE_RATE], 3)
-    from tests.filter.test_arrays import PATHS
-
     heard = np.stack([np.convolve(said, path)[: said.size] for path in PATHS[:3]], 1) + 1e-3 * fan(said.size, 3, 21)
     heard[:, 2] *= 2.0
     soundfile.write(made / "five.wav", np.column_stack((said, heard, said)), SAMPLE_RATE, "FLOAT")

@@ -12,8 +12,7 @@ from edgefilter.diagnosis.recording import Recording
 from edgefilter.echo.effect import complete, vanishes
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.measurement import Values
-from tests.diagnosis.robot_scene import profile, record, voice
-from tests.diagnosis.test_packet_loss import coded, lossy
+from tests.diagnosis.robot_scene import coded, lossy, profile, record, voice
 
 SECONDS = 8.0
 

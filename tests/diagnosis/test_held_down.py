@@ -10,7 +10,7 @@ from scipy.ndimage import maximum_filter1d, uniform_filter1d
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.trials import Workbench
-from tests.diagnosis.robot_scene import profile, record, voice
+from tests.diagnosis.robot_scene import feedback, profile, record, voice
 
 RATE = 16000
 RIVALS = ("playback_gain", "compression", "limiter", "multiband_compression", "equaliser", "early_path")
@@ -21,17 +21,6 @@ def looking_ahead(x: np.ndarray) -> np.ndarray:
     ceiling = 0.45 * np.abs(x).max()
     needed = np.minimum(1.0, ceiling / np.maximum(maximum_filter1d(np.abs(x), 480), ceiling / 10))
     return x * uniform_filter1d(needed, 160)
-
-
-def feedback(x: np.ndarray, ratio: float, threshold_db: float) -> np.ndarray:
-    """A compressor that hears its own output, in steps of 2 ms, 5 ms to come and 100 ms to go."""
-    out, gain_db = np.zeros_like(x), 0.0
-    for at in range(0, x.size, 32):
-        out[at : at + 32] = x[at : at + 32] * 10 ** (gain_db / 20)
-        over = 10 * np.log10(np.mean(out[at : at + 32] ** 2) + 1e-12) - threshold_db
-        wanted = min(-(ratio - 1.0) * over, 0.0)
-        gain_db += (wanted - gain_db) * (0.15 if wanted < gain_db else 0.02)
-    return out
 
 
 def in_bands(x: np.ndarray) -> np.ndarray:

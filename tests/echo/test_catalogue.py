@@ -1,5 +1,4 @@
-"""The catalogue is the one place that lists effects: no other module spells a name, no import runs in a circle, the
-order is its own."""
+"""The catalogue is the one place that lists effects: no other module spells a name, the order is its own."""
 
 from __future__ import annotations
 
@@ -59,25 +58,6 @@ def test_an_effect_is_asked_and_not_searched_for_attributes() -> None:
     asking = [path for folder in ("echo", "diagnosis", "report") for path in sorted((PACKAGE / folder).rglob("*.py"))]
     assert len(asking) > 40
     assert [path.name for path in asking if "hasattr(" in path.read_text(encoding="utf-8")] == []
-
-
-def test_imports_among_echo_run_in_no_circle() -> None:
-    """Those inside functions and those for types alone count."""
-    folder = PACKAGE / "echo"
-    modules = {
-        ".".join(("edgefilter", *path.relative_to(PACKAGE).with_suffix("").parts)): path
-        for path in folder.rglob("*.py")
-    }
-    needs = {}
-    for name, path in modules.items():
-        used = [
-            node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.ImportFrom)
-        ]
-        needs[name] = {node.module for node in used if node.module in modules}
-    assert needs["edgefilter.echo.model"]
-    while free := [name for name, below in needs.items() if not below]:
-        needs = {name: below - set(free) for name, below in needs.items() if name not in free}
-    assert not needs, f"circle among {', '.join(sorted(needs))}"
 
 
 def test_the_list_follows_the_sound() -> None:

@@ -217,7 +217,7 @@ def test_the_documented_effect_lowers_what_the_running_filter_leaves(tmp_path):
     turned = {"rate_hz": 23.0, "cosine": 0.2, "sine": 0.12}  # another start: the blades stand elsewhere
     heard = record(x, robot.echo.with_effect("blade_chop", turned))
     knowing = robot.with_echo(robot.echo.with_effect("blade_chop", fitted))
-    left = [enhance(heard, x, known, "linear")[4 * 16000 :] for known in (robot, knowing)]
+    left = [enhance(heard, x, known, engine="linear")[4 * 16000 :] for known in (robot, knowing)]
     without, with_it = (10 * np.log10(np.mean(rest.astype(float) ** 2)) for rest in left)
     assert with_it < without - 6  # as docs/own_effect.md says
     assert reach(find("blade_chop"), fitted) == ""

@@ -22,7 +22,7 @@ def demo() -> tuple[np.ndarray, np.ndarray, Profile]:
 @pytest.mark.parametrize("engine", ["paper-ss", "ss", "crnn"])
 def test_alone(engine: str) -> None:
     mic, ref, profile = demo()
-    ego, out, probability = EgoFilter(profile, engine), [], []
+    ego, out, probability = EgoFilter(profile, engine=engine), [], []
     for at in range(0, ref.size, 2000):
         out.append(ego.process(mic[at : at + 2000], ref[at : at + 2000]))
         probability.append(ego.speech_probability)
@@ -33,7 +33,7 @@ def test_alone(engine: str) -> None:
 def test_with_another_lag() -> None:
     """The paper's alignment has to find where the reference is."""
     mic, ref, profile = demo()
-    ego = EgoFilter(profile, "paper-ss")
+    ego = EgoFilter(profile, engine="paper-ss")
     out = np.concatenate((ego.process(mic, np.pad(ref, (3000, 0))[: ref.size]), ego.flush()))
     same_as_before("engine_paper-ss_later", {"out": levels_db(out), "alignment": ego.stats()["alignment"]}, 0.05)
 

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from edgefilter import engines
-from edgefilter.echo.model import EchoModel
 from edgefilter.errors import SignalError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter, enhance
 from edgefilter.filter.stream import Stream, step
-from edgefilter.profile.data import Profile
-from edgefilter.types import PRE_ROLL, Frame, Output
+from edgefilter.types import Frame, Output
 from tests import conformance
+from tests.conformance import robot
 
 DATA = Path(__file__).parents[1] / "data"
 MODELS = {"crnn": DATA / "crnn.onnx", "paper-crnn": DATA / "paper_crnn.onnx"}
@@ -22,23 +21,6 @@ CASES = [
     for name in engines.ENGINES
     for check in (conformance.CLIP_CHECKS if name == "paper-crnn" else conformance.CHECKS)
 ]
-
-
-def robot() -> Profile:
-    """A profile that fits conformance.conversation: direct sound and a short decaying tail."""
-    rng = np.random.default_rng(0)
-    response = np.zeros(2048, np.float32)
-    response[PRE_ROLL : PRE_ROLL + 600] = 0.1 * rng.standard_normal(600) * np.exp(-np.arange(600) / 120)
-    response[PRE_ROLL] = 0.6
-    return Profile(
-        echo=EchoModel(response),
-        delay=900.0,
-        response=np.full(601, 0.6, np.float32),
-        noise_psd=np.full(601, 1e-10, np.float32),
-        band_hz=np.array([[100.0, 8000.0]]),
-        band_snr_db=np.array([40.0]),
-        distortion_db=np.full(4, -40.0),
-    )
 
 
 @pytest.mark.parametrize("name, check", CASES, ids=lambda value: getattr(value, "__name__", value))

@@ -255,7 +255,7 @@ def test_the_exact_network_filters_the_demo_as_the_int8_one_does():
         soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference", "human")
     )
     models = (ROOT / "models/crnn.onnx", ROOT / "models/crnn_int8.onnx")
-    exact, small = (enhance(mic, ref, DEMO / "profile.npz", "crnn", model) for model in models)
+    exact, small = (enhance(mic, ref, DEMO / "profile.npz", engine="crnn", model=model) for model in models)
     speaking = np.flatnonzero(human)
     span = slice(speaking[0], speaking[-1] + 1)
     for out in (exact, small):

@@ -7,7 +7,7 @@ from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.spectral_subtraction import FLOOR, SpectralSubtraction
 from edgefilter.filter.residual_echo import Residual
 from edgefilter.types import Frame
-from tests.engines.test_engines import robot
+from tests.conformance import robot
 
 STFT = StftConfig()
 NOTHING = np.zeros(STFT.bins, np.float32)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-
 import numpy as np
 import pytest
 
@@ -19,42 +17,7 @@ from edgefilter.filter.turns import Turns, overlap_add
 from edgefilter.profile.data import Profile
 from edgefilter.types import Frame, Output
 from tests.conformance import conversation
-
-RATE = 16000
-PATHS = [0.3 * np.eye(1, 900, 300 + at)[0] + 0.1 * np.eye(1, 900, 500 - 3 * at)[0] for at in range(4)]
-
-
-def noise(n: int, seed: int) -> np.ndarray:
-    return np.random.default_rng(seed).standard_normal(n)
-
-
-def fan(n: int, microphones: int, seed: int) -> np.ndarray:
-    """(n, microphones): one source with a delay a microphone, and a little of each microphone's own."""
-    source = noise(n + 10, seed)
-    return np.stack([source[at : at + n] + 0.1 * noise(n, seed + 10 + at) for at in range(microphones)], axis=1)
-
-
-@functools.cache
-def calibration(microphones: int) -> Profile:
-    sweep = generate_sweep()
-    heard = np.stack([np.convolve(sweep, path)[: sweep.size] for path in PATHS[:microphones]], axis=1)
-    heard = heard + 1e-3 * fan(sweep.size, microphones, 3)
-    return calibrate(sweep, heard.astype(np.float32), (1e-3 * fan(64000, microphones, 4)).astype(np.float32))
-
-
-@functools.cache
-def talk(microphones: int = 3, seconds: float = 6.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Microphones (n, m), reference (n,), and the human in the first microphone (n,), who talks from 3 to 5 s."""
-    n = round(seconds * RATE)
-    syllables = np.repeat(np.abs(noise(n // 1600 + 1, 6)), 1600)[:n]
-    ref = 0.1 * noise(n, 5) * syllables
-    human = np.zeros(n)
-    human[3 * RATE : 5 * RATE] = 0.02 * noise(2 * RATE, 7) * np.repeat(np.abs(noise(20, 12)), 1600)
-    mic = np.stack(
-        [np.convolve(ref, path)[:n] + np.roll(human, -2 * at) for at, path in enumerate(PATHS[:microphones])], 1
-    )
-    mic = mic + 2e-3 * fan(n, microphones, 8)
-    return mic.astype(np.float32), ref.astype(np.float32), human.astype(np.float32)
+from tests.filter.array_scene import PATHS, RATE, calibration, fan, noise, talk
 
 
 class Told(SpectralSubtraction):
@@ -99,7 +62,7 @@ def test_any_partition_of_an_array_gives_the_same_bits() -> None:
     mic, ref, _ = talk()
     profile, whole = calibration(3), []
     for sizes in ([mic.shape[0]], [1, 255, 256, 300, 4096, 7]):
-        ego, out, at = EgoFilter(profile, "ss"), [], 0
+        ego, out, at = EgoFilter(profile, engine="ss"), [], 0
         while at < len(ref):
             for size in sizes:
                 out.append(ego.process(mic[at : at + size], ref[at : at + size]))
@@ -129,9 +92,9 @@ def test_engines_without_a_linear_stage_hear_the_first_microphone() -> None:
 def test_other_microphones_than_were_calibrated_are_one_line() -> None:
     mic, ref, _ = talk()
     with pytest.raises(SignalError, match="mic has 2 channels and the profile 3, expected as many: choose"):
-        EgoFilter(calibration(3), "ss").process(mic[:, :2], ref)
+        EgoFilter(calibration(3), engine="ss").process(mic[:, :2], ref)
     with pytest.raises(SignalError, match="mic has 1 channels and the profile 3"):
-        EgoFilter(calibration(3), "ss").process(mic[:, 0], ref)
+        EgoFilter(calibration(3), engine="ss").process(mic[:, 0], ref)
     ego = EgoFilter(engine="ss")
     ego.process(mic[:1000], ref[:1000])
     with pytest.raises(SignalError, match="mic has 2 channels after 3, expected as many to the end"):
@@ -169,7 +132,7 @@ def test_a_microphone_that_is_no_part_of_the_array_is_left_out(change, reason) -
     mic[:, 1] = change(mic[:, 1])
     if reason == "clipped":  # beside others that are nearly as loud, and are not
         mic[:, ::2] *= np.float32(0.9 / np.abs(mic[:, ::2]).max())
-    ego = EgoFilter(calibration(3), "ss")
+    ego = EgoFilter(calibration(3), engine="ss")
     ego.process(mic, ref)
     stats = ego.stats()["array"]
     assert stats["microphones"] == 3 and list(stats["left_out"]) == ["1"] and reason in stats["left_out"]["1"]
@@ -181,7 +144,7 @@ def test_equal_channels_count_as_one_and_another_takes_the_place_of_the_first() 
     twice, silent = mic.copy(), mic.copy()
     twice[:, 2], silent[:, 0] = mic[:, 0], 0.0
     for heard, expected in ((twice, (0, {"2": "the same as channel 0"})), (silent, (1, {"0": "silent"}))):
-        ego = EgoFilter(calibration(3), "ss")
+        ego = EgoFilter(calibration(3), engine="ss")
         out = np.concatenate((ego.process(heard, ref), ego.flush()))
         stats = ego.stats()["array"]
         assert (stats["reference"], stats["left_out"]) == expected
@@ -226,7 +189,7 @@ def test_a_microphone_is_clipped_where_16_samples_of_a_second_reach_full_scale_n
 )
 def test_channels_that_were_exchanged_since_the_calibration_are_left_out_by_name(order, left_out) -> None:
     mic, ref, _ = talk()
-    ego = EgoFilter(calibration(3), "ss")
+    ego = EgoFilter(calibration(3), engine="ss")
     ego.process(mic[:, order], ref)
     found = ego.stats()["array"]["left_out"]
     told = {at: f"exchanged: it hears the robot as channel {other} was calibrated to" for at, other in left_out.items()}
@@ -238,7 +201,7 @@ def test_a_first_microphone_that_is_left_out_has_set_the_volume_of_no_other(fact
     mic, ref, _ = talk()
     mic = mic.copy()
     mic[:, 0] *= factor
-    ego = EgoFilter(calibration(3), "linear", keep_channels=True)
+    ego = EgoFilter(calibration(3), engine="linear", keep_channels=True)
     ego.process(mic[: 2 * RATE], ref[: 2 * RATE])
     assert list(ego.stats()["array"]["left_out"]) == ["0"]
     assert abs(ego.stats()["linear_stage"]["gain_db"]) < 1.0
@@ -260,7 +223,7 @@ def test_where_another_microphone_takes_the_place_of_the_first_the_delay_stays_w
     mic, ref, _ = talk()
     mic = mic.copy()
     mic[:, :2] = 0.0  # the third hears the robot two samples later, by a path on the first one's clock
-    ego = EgoFilter(calibration(3), "linear", keep_channels=True)
+    ego = EgoFilter(calibration(3), engine="linear", keep_channels=True)
     ego.process(mic[: 3 * RATE], ref[: 3 * RATE])
     assert ego.stats()["array"] == {"microphones": 3, "reference": 2, "left_out": {"0": "silent", "1": "silent"}}
     assert ego.stats()["alignment"]["delay_samples"] == pytest.approx(calibration(3).delay, abs=0.2)
@@ -376,7 +339,7 @@ def test_a_calibration_says_what_is_doubtful_about_a_channel() -> None:
 def test_an_array_learns_and_its_profile_is_adapted_in_all_microphones() -> None:
     mic, ref, _ = talk()
     profile = calibration(3)
-    ego = EgoFilter(profile, "linear", learn=PathLearner(profile))
+    ego = EgoFilter(profile, engine="linear", learn=PathLearner(profile))
     ego.process(0.5 * mic, ref)
     adapted = ego.adapted_profile()
     assert adapted.microphones == 3
@@ -389,7 +352,7 @@ def test_an_array_learns_and_its_profile_is_adapted_in_all_microphones() -> None
 def test_each_microphone_is_given_with_the_robot_removed_where_asked(microphones: int) -> None:
     mic, ref, _ = talk()
     heard = mic[:, :microphones] if microphones > 1 else mic[:, 0]
-    ego = EgoFilter(calibration(microphones), "linear", keep_channels=True)
+    ego = EgoFilter(calibration(microphones), engine="linear", keep_channels=True)
     parts = []
     for at in range(0, ref.size, 5000):
         ego.process(heard[at : at + 5000], ref[at : at + 5000])
@@ -402,6 +365,6 @@ def test_each_microphone_is_given_with_the_robot_removed_where_asked(microphones
     human = slice(round(3.2 * RATE), round(4.8 * RATE))  # in its place: what is left there is the human
     alike = [np.corrcoef(one, np.roll(talk()[2], -2 * at)[human])[0, 1] for at, one in enumerate(removed[human].T)]
     assert min(alike) > 0.9
-    quiet = EgoFilter(calibration(microphones), "linear")
+    quiet = EgoFilter(calibration(microphones), engine="linear")
     quiet.process(heard, ref)
     assert quiet.robot_removed().size == 0

@@ -37,7 +37,7 @@ def told(ego: EgoFilter, mic: np.ndarray, ref: np.ndarray) -> dict:
 def test_of_the_demonstration(engine: str, knows: bool) -> None:
     mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
     profile = Profile.load(DEMO / "profile.npz") if knows else None
-    found = told(EgoFilter(profile, engine), mic, ref)
+    found = told(EgoFilter(profile, engine=engine), mic, ref)
     same_as_before(f"filter_demo_{engine}_{'known' if knows else 'unknown'}", found, 0.1, 1e-3)
 
 
@@ -80,4 +80,4 @@ def test_of_an_array_with_a_microphone_that_breaks() -> None:
     mics, ref, _ = talk()
     mics = mics.copy()
     mics[mics.shape[0] // 2 :, 2] = 0.0
-    same_as_before("filter_array", told(EgoFilter(calibration(3), "crnn"), mics, ref), 0.3, 1e-3)
+    same_as_before("filter_array", told(EgoFilter(calibration(3), engine="crnn"), mics, ref), 0.3, 1e-3)

@@ -25,7 +25,7 @@ def test_without_a_profile_rumble_is_lowered_and_with_one_it_is_as_it_was():
     rumble, voice = ((0.1 * np.sin(2 * np.pi * hz * t)).astype(np.float32) for hz in (40, 400))
     steady = slice(SAMPLE_RATE // 2, -SAMPLE_RATE // 2)
     for profile, left in ((None, RUMBLE), (robot(), 1.0)):
-        out = enhance(rumble + voice, np.zeros(t.size, np.float32), profile, "linear")[steady]
+        out = enhance(rumble + voice, np.zeros(t.size, np.float32), profile, engine="linear")[steady]
         for tone, gain in ((rumble, left), (voice, 1.0)):
             found = float(out.dot(tone[steady]) / tone[steady].dot(tone[steady]))
             assert abs(found - gain) < 0.05, (gain, found)  # a window's main lobe reaches 60 Hz beyond the tone
@@ -157,11 +157,11 @@ def test_the_canceller_s_doubt_of_its_path_is_expected_as_echo_and_the_room_fall
 def test_an_offset_of_the_microphone_leaves_the_robot_removed_and_is_removed_itself():
     """-30 dB of full scale, as cheap microphones have: 5 to 7 dB less were removed, and the robot's path learned in vain."""
     mic, ref = demonstration()
-    plain, offset = (enhance(x, ref, None, "linear") for x in (mic, mic + np.float32(0.0316)))
+    plain, offset = (enhance(x, ref, None, engine="linear") for x in (mic, mic + np.float32(0.0316)))
     later = slice(3 * SAMPLE_RATE, 6 * SAMPLE_RATE)
     assert level_db(offset[later]) < level_db(plain[later]) + 0.5
     assert abs(float(offset[later].mean())) < 1e-4
-    calibrated = enhance(mic + np.float32(0.0316), ref, DEMO / "profile.npz", "linear")
+    calibrated = enhance(mic + np.float32(0.0316), ref, DEMO / "profile.npz", engine="linear")
     assert abs(float(calibrated[later].mean())) < 1e-4
 
 
@@ -172,7 +172,7 @@ def test_hum_and_rumble_do_not_spoil_what_is_learned_at_the_robot_s_frequencies(
     voice = signal.butter(4, 300, "high", fs=SAMPLE_RATE, output="sos")
     later = slice(3 * SAMPLE_RATE, 6 * SAMPLE_RATE)
     without, beside = (
-        level_db(signal.sosfiltfilt(voice, enhance(x, ref, None, "linear"))[later]) for x in (mic, mic + hum)
+        level_db(signal.sosfiltfilt(voice, enhance(x, ref, None, engine="linear"))[later]) for x in (mic, mic + hum)
     )
     assert beside < without + 9.0  # 7 dB; 11 dB without the bound
 

@@ -134,7 +134,7 @@ def test_never_louder_than_the_microphone(make, engine, calibrated):
     mic, ref = make()
     known = (calibrated,) if engine in engines.NEEDS_PROFILE else (None, calibrated)
     for at_hand in known:
-        out = enhance(mic, ref, at_hand, engine)
+        out = enhance(mic, ref, at_hand, engine=engine)
         assert np.isfinite(out).all()
         assert loudest_over_mic_db(mic, out) < 1.0, "calibrated" if at_hand else "not calibrated"
 
@@ -150,7 +150,7 @@ def test_the_profile_of_these_scenes_is_true():
     """Otherwise the warm half of the tests above would begin with a path that means nothing."""
     assert isinstance(profile().echo, EchoModel)
     ref, echo, _, fan, _ = scene()
-    out = enhance(echo + fan, ref, profile(), "linear")
+    out = enhance(echo + fan, ref, profile(), engine="linear")
     assert 10 * np.log10(np.mean(echo[-SAMPLE_RATE:] ** 2) / np.mean(out[-SAMPLE_RATE:] ** 2)) > 20
 
 
@@ -164,6 +164,6 @@ def test_one_loud_sample_of_the_reference_costs_the_rest_next_to_nothing(click):
     echo = np.concatenate((heard(ref, path, 900)[: pause.stop], heard(ref, path, 6000)[pause.stop :]))
     clicked = ref.copy()
     clicked[2 * SAMPLE_RATE] = click
-    left = [enhance(echo + fan, played, profile(), "linear")[-2 * SAMPLE_RATE :] for played in (ref, clicked)]
+    left = [enhance(echo + fan, played, profile(), engine="linear")[-2 * SAMPLE_RATE :] for played in (ref, clicked)]
     power = [float(np.mean(x**2)) for x in left]
     assert power[1] < 1.4 * power[0]  # 1.5 dB: of the path a part is learnt again

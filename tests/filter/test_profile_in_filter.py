@@ -38,7 +38,7 @@ def test_a_robot_that_stands_elsewhere_is_aligned_by_its_path_of_today():
     folded = EchoModel(elsewhere.response())
     mic = record(reference, folded)
     by_effect, by_response = (
-        enhance(mic, reference, profile().with_echo(echo), "linear") for echo in (elsewhere, folded)
+        enhance(mic, reference, profile().with_echo(echo), engine="linear") for echo in (elsewhere, folded)
     )
     np.testing.assert_array_equal(by_effect, by_response)
 
@@ -51,7 +51,7 @@ def test_an_effect_in_the_profile_lowers_the_residual_of_a_robot_that_has_it(ref
         np.float32
     )
     aligned = slice(2_000, 24_000)
-    without, with_it = (db(enhance(mic, reference, profile, "linear")[aligned]) for profile in (plain, knowing))
+    without, with_it = (db(enhance(mic, reference, profile, engine="linear")[aligned]) for profile in (plain, knowing))
     assert (
         with_it < without - 3
     )  # the effect is known exactly; half the residual power is a modest ask, adaptation closes part of the gap
@@ -61,7 +61,7 @@ def test_the_tail_is_the_profiles_within_128_and_512_ms(reference):
     for taps, expected in ((600, 2048), (2048, 2048), (5000, 5120), (20_000, 8192)):
         path = np.r_[np.zeros(PRE_ROLL), 0.5, np.zeros(taps - PRE_ROLL - 1)].astype(np.float32)
         profile = robot().with_echo(EchoModel(path))
-        ego = EgoFilter(profile, "linear")
+        ego = EgoFilter(profile, engine="linear")
         assert ego.stats()["linear_stage"]["partitions"] * ego.hop == expected
 
 
@@ -77,12 +77,12 @@ def test_the_adapted_path_written_into_a_profile_starts_better_than_the_old_one(
     mic = echo_of(old.with_echo(EchoModel(moved)), reference) + 1e-4 * rng.standard_normal(reference.size).astype(
         np.float32
     )
-    ego = EgoFilter(old, "linear")
+    ego = EgoFilter(old, engine="linear")
     ego.process(mic, reference)
     ego.adapted_profile().save(tmp_path / "adapted.npz")
     start = slice(4_000, 12_000)
     before, after = (
-        db(enhance(mic, reference, profile, "linear")[start]) for profile in (old, tmp_path / "adapted.npz")
+        db(enhance(mic, reference, profile, engine="linear")[start]) for profile in (old, tmp_path / "adapted.npz")
     )
     assert after < before - 6  # four seconds of learning against none; 3 dB would already be a different path
 
@@ -106,7 +106,7 @@ def room(taps=12_000):
 
 def test_the_path_behind_the_linear_stage_is_not_cut_off_where_it_is_written_back(reference, tmp_path):
     old = long_robot()
-    ego = EgoFilter(old, "linear")
+    ego = EgoFilter(old, engine="linear")
     held = ego.stats()["linear_stage"]["partitions"] * ego.hop
     assert held == 8192
     ego.process(echo_of(old, reference), reference)
@@ -119,7 +119,7 @@ def test_the_path_behind_the_linear_stage_is_not_cut_off_where_it_is_written_bac
 def test_path_effects_are_neither_lost_nor_applied_twice_where_the_path_is_written_back(reference):
     band = ("bandlimit", {"cutoff_hz": 5000.0, "order": 4.0, "phase": 0.0, "delay": 0.0, "taps": 0.0})
     old = long_robot(6_000, (("playback_gain", {"gain_db": -3.0}), room(), band))
-    ego = EgoFilter(old, "linear")
+    ego = EgoFilter(old, engine="linear")
     ego.process(np.zeros(8_000, np.float32), np.zeros(8_000, np.float32))  # nothing is heard, so nothing is learnt
     new = ego.adapted_profile()
     assert [name for name, _ in new.echo.effects] == ["playback_gain"]
@@ -130,13 +130,13 @@ def test_path_effects_are_neither_lost_nor_applied_twice_where_the_path_is_writt
     # before it
     heard, still = old.echo.predict(reference), new.echo.predict(reference)
     assert db(still - heard) < db(heard) - 50
-    twice = EgoFilter(new, "linear").adapted_profile().echo.running_response()
+    twice = EgoFilter(new, engine="linear").adapted_profile().echo.running_response()
     np.testing.assert_allclose(twice, after, atol=1e-6)
 
 
 def test_the_kept_end_of_the_path_follows_the_volume_that_was_turned(reference):
     old = long_robot()
-    ego = EgoFilter(old, "linear")
+    ego = EgoFilter(old, engine="linear")
     ego.process(np.float32(1.6) * echo_of(old, reference), reference)
     turned = 10 ** (ego.stats()["linear_stage"]["gain_db"] / 20)
     assert turned > 1.3
@@ -147,7 +147,7 @@ def test_the_kept_end_of_the_path_follows_the_volume_that_was_turned(reference):
 def test_the_longest_path_with_reverberation_behind_it_can_still_be_written_back(tmp_path):
     old = long_robot(64_000, (room(),), decay=200_000)
     assert old.echo.running_response().size > 64_000
-    EgoFilter(old, "linear").adapted_profile().save(tmp_path / "adapted.npz")
+    EgoFilter(old, engine="linear").adapted_profile().save(tmp_path / "adapted.npz")
     assert Profile.load(tmp_path / "adapted.npz").echo.impulse_response.size == 64_000
 
 

@@ -165,6 +165,6 @@ def test_after_a_minute_of_a_muted_microphone_the_fan_is_found_again():
 
 def test_a_profile_without_any_fan_can_hear_silence():
     profile = Profile.load(DEMO / "profile.npz")
-    ego = EgoFilter(replace(profile, noise_psd=np.zeros_like(profile.noise_psd)), "ss")
+    ego = EgoFilter(replace(profile, noise_psd=np.zeros_like(profile.noise_psd)), engine="ss")
     nothing = np.zeros(8_000, np.float32)
     assert not ego.process(nothing, nothing).any()

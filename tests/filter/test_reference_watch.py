@@ -44,7 +44,7 @@ def events(ego, mic, ref, block=256):
 @pytest.mark.parametrize("late_ms", [60, 157, 300])
 def test_a_robot_whose_reference_is_late_is_not_taken_for_somebody_and_the_lateness_is_said(robot, profile, late_ms):
     mic, ref = robot
-    found = events(EgoFilter(profile, "crnn"), mic, later(ref, LAG + 16 * late_ms))
+    found = events(EgoFilter(profile, engine="crnn"), mic, later(ref, LAG + 16 * late_ms))
     assert "speech_started" not in {event.kind for event in found}
     (late,) = (event for event in found if event.kind == "reference_late")
     assert f"comes {late_ms} ms after" in late.detail or f"comes {late_ms - 1} ms after" in late.detail
@@ -54,7 +54,7 @@ def test_a_robot_whose_reference_is_late_is_not_taken_for_somebody_and_the_laten
 @pytest.mark.slow
 def test_a_reference_in_time_is_said_nothing_of_and_the_human_is_noticed_as_before():
     mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
-    found = events(EgoFilter(DEMO / "profile.npz", "crnn"), mic, ref)
+    found = events(EgoFilter(DEMO / "profile.npz", engine="crnn"), mic, ref)
     assert not {event.kind for event in found} & set(SET_UP_WRONG)
     (began,) = (event for event in found if event.kind == "speech_started")
     assert 9.1 < began.sample / RATE < 9.6
@@ -68,7 +68,7 @@ def test_a_sentence_said_again_while_its_first_echo_still_sounds_is_no_late_refe
     )
     fan = 1e-4 * np.random.default_rng(0).standard_normal(said.size).astype(np.float32)
     profile = Profile.load(DEMO / "profile.npz")
-    found = events(EgoFilter(profile, "linear"), later(profile.echo.predict(said), 19_200) + fan, said)
+    found = events(EgoFilter(profile, engine="linear"), later(profile.echo.predict(said), 19_200) + fan, said)
     assert "realigned" in {event.kind for event in found}
     assert not {event.kind for event in found} & set(SET_UP_WRONG)
 
@@ -86,7 +86,7 @@ def test_the_microphone_waits_for_a_reference_that_comes_some_milliseconds_late(
 @pytest.mark.slow
 def test_a_late_reference_that_is_mended_is_forgotten(robot):
     mic, ref = robot
-    ego = EgoFilter(DEMO / "profile.npz", "crnn")
+    ego = EgoFilter(DEMO / "profile.npz", engine="crnn")
     assert "reference_late" in {event.kind for event in events(ego, mic, later(ref, LAG + 4800))}
     talking = soundfile.read(DEMO / "mic.flac", dtype="float32")[0]
     reference = soundfile.read(DEMO / "reference.flac", dtype="float32")[0]
@@ -161,7 +161,7 @@ def test_a_microphone_that_is_processed_is_said_and_a_good_one_is_not(robot):
 def test_a_profile_of_another_scale_is_no_microphone_that_is_processed(robot):
     """80 dB louder than the microphone until the first words have told the scale, the echo seemed to be unpredicted."""
     mic, ref = robot
-    ego = EgoFilter(DEMO / "profile.npz", "linear")
+    ego = EgoFilter(DEMO / "profile.npz", engine="linear")
     assert not [event for event in events(ego, 0.01 * mic, 100 * ref) if event.kind in SET_UP_WRONG]
     assert ego.stats()["linear_stage"]["removed_db"] > 20.0
 

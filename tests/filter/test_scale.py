@@ -39,7 +39,7 @@ def test_neither_the_level_of_the_reference_nor_that_of_the_microphone_changes_t
     late = np.flatnonzero(spoken)[0]
 
     def quality(heard: float, played: float) -> tuple[float, float]:
-        out = enhance(np.float32(heard) * mic, np.float32(played) * ref, profile, engine)[late:]
+        out = enhance(np.float32(heard) * mic, np.float32(played) * ref, profile, engine=engine)[late:]
         level = 10 * np.log10(np.sum(out.astype(float) ** 2) / np.sum((heard * mic[late:].astype(float)) ** 2))
         return si_sdr(out, human[late:]), level
 
@@ -54,7 +54,7 @@ def test_a_human_is_noticed_at_the_same_times_at_any_level(recording, factors):
     mic, ref, _ = recording
     times = []
     for heard, played in ((1.0, 1.0), factors):
-        ego = EgoFilter(None, "crnn")
+        ego = EgoFilter(None, engine="crnn")
         ego.process(np.float32(heard) * mic, np.float32(played) * ref)
         times.append([event.sample for event in ego.events() if event.kind.startswith("speech")])
     assert len(times[0]) == len(times[1])

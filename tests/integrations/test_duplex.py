@@ -286,7 +286,7 @@ def test_a_robot_is_removed_though_the_microphone_lost_a_fifth_of_a_second_of_it
     """What was lost of its reference is still to be heard then, for as long as the lag: it passed, and was taken for a human."""
     mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
     clock = Clock()
-    duplex, out, happened = Duplex(EgoFilter(room_of.PROFILE, "crnn"), clock=clock), [], []
+    duplex, out, happened = Duplex(EgoFilter(room_of.PROFILE, engine="crnn"), clock=clock), [], []
     for at in range(0, 6 * RATE, 320):
         clock.now = (at + 320) / RATE
         duplex.play(ref[at : at + 320], RATE)
@@ -379,7 +379,7 @@ def test_a_rate_or_channels_that_are_not_the_microphone_s_are_said_once(witness,
 
 def test_an_agent_whose_reference_is_late_does_not_interrupt_itself_and_the_log_says_why(room_of, caplog):
     room, events = room_of.Room(), []
-    duplex = Duplex(EgoFilter(room_of.PROFILE, "crnn"), on_event=events.append)
+    duplex = Duplex(EgoFilter(room_of.PROFILE, engine="crnn"), on_event=events.append)
     room.play(room_of.ROBOT)
     for step in range(250):
         if step == 20:  # 0.4 s after the loudspeaker
@@ -435,7 +435,7 @@ def test_the_robot_is_removed_though_its_speech_comes_in_bursts_is_cut_off_and_b
     """At other rates than the filter's; the loudspeaker drops what it holds when the speech is cut off."""
     room = room_of.Room()
     events = []
-    duplex = Duplex(EgoFilter(room_of.PROFILE, "crnn"), on_event=events.append)
+    duplex = Duplex(EgoFilter(room_of.PROFILE, engine="crnn"), on_event=events.append)
     heard, filtered = [], []
     for step in range(300):
         if step in (0, 150):
@@ -468,8 +468,8 @@ def test_an_array_goes_through_to_the_filter_and_one_channel_comes_back(rate):
 
 def test_named_channels_are_an_array_and_others_are_not_heard(pair):
     profile, sound = pair
-    duplex = Duplex(EgoFilter(profile, "linear"), mic_channels=[1, 2])
-    alone = EgoFilter(profile, "linear")
+    duplex = Duplex(EgoFilter(profile, engine="linear"), mic_channels=[1, 2])
+    alone = EgoFilter(profile, engine="linear")
     pcm = np.rint(sound[:RATE] * 32768).astype("<i2")
     out = from_pcm16(duplex.hear_pcm16(pcm.tobytes(), RATE, 3), 3)
     assert duplex.ego.stats()["array"]["microphones"] == 2
@@ -513,13 +513,13 @@ def test_a_channel_of_the_device_is_the_reference_and_what_is_said_is_none(witne
 
 def test_an_array_with_a_loopback_beside_it_does_what_the_filter_does_with_both(talking):
     profile, sound = talking
-    duplex = Duplex(EgoFilter(profile, "linear"), mic_channels=[1, 2], reference_channel=0)
+    duplex = Duplex(EgoFilter(profile, engine="linear"), mic_channels=[1, 2], reference_channel=0)
     pcm = np.rint(sound * 32768).astype("<i2")
     out = np.concatenate(
         [from_pcm16(duplex.hear_pcm16(pcm[at : at + 320].tobytes(), RATE, 3, 1)) for at in range(0, len(pcm), 320)]
     )
     both = pcm.astype(np.float32) / 32768
-    expected = EgoFilter(profile, "linear").process(both[:, 1:], both[:, 0])
+    expected = EgoFilter(profile, engine="linear").process(both[:, 1:], both[:, 0])
     np.testing.assert_allclose(out, expected, atol=1 / 32768)
     part = slice(RATE, 2 * RATE)
     assert np.mean(out[part] ** 2) < 0.01 * np.mean(both[part, 1] ** 2), "the robot alone"
@@ -547,7 +547,7 @@ def test_that_channels_are_averaged_is_said_once(caplog):
 def test_a_recogniser_gets_the_finished_turn_and_where_there_is_none_what_was_streamed(pair, rate):
     profile, sound = pair
     ended = []
-    duplex = Duplex(EgoFilter(profile, "crnn"), on_event=ended.append, mic_channels=[1, 2])
+    duplex = Duplex(EgoFilter(profile, engine="crnn"), on_event=ended.append, mic_channels=[1, 2])
     turns, hop = TurnByTurn(duplex), 320
     turns.start()
     for at in range(0, len(sound), hop):
@@ -569,7 +569,7 @@ def test_a_recogniser_gets_the_finished_turn_and_where_there_is_none_what_was_st
 
 def test_of_a_turn_only_what_belongs_to_the_recogniser_s_is_taken(pair):
     profile, sound = pair
-    duplex = Duplex(EgoFilter(profile, "crnn"), mic_channels=[1, 2])
+    duplex = Duplex(EgoFilter(profile, engine="crnn"), mic_channels=[1, 2])
     turns = TurnByTurn(duplex)
     duplex.hear(sound[:24_000], RATE)
     turns.start(duplex.heard)

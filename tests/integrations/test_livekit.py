@@ -159,7 +159,7 @@ class Recogniser(stt.STT):
 def test_a_recogniser_behind_the_stream_adapter_gets_the_finished_turn_of_an_array(pair, enabled):
     profile, sound = pair
     events, recogniser = [], Recogniser()
-    ears = EgoProcessor(EgoFilter(profile, "crnn"), events.append, mic_channels=[1, 2])
+    ears = EgoProcessor(EgoFilter(profile, engine="crnn"), events.append, mic_channels=[1, 2])
     ears.enabled = enabled
 
     async def converse():
@@ -185,7 +185,7 @@ def test_a_recogniser_behind_the_stream_adapter_gets_the_finished_turn_of_an_arr
 
 def test_each_event_tells_how_long_the_human_has_spoken_or_been_silent(pair):
     profile, sound = pair
-    ears = EgoProcessor(EgoFilter(profile, "crnn"), mic_channels=[1, 2])
+    ears = EgoProcessor(EgoFilter(profile, engine="crnn"), mic_channels=[1, 2])
 
     async def watch():
         stream = ears.vad().stream()
@@ -209,7 +209,7 @@ def test_each_event_tells_how_long_the_human_has_spoken_or_been_silent(pair):
 
 def test_the_loopback_of_the_device_is_the_reference_where_it_is_named(talking):
     profile, sound = talking
-    ears = EgoProcessor(EgoFilter(profile, "linear"), mic_channels=[1, 2], reference_channel=0)
+    ears = EgoProcessor(EgoFilter(profile, engine="linear"), mic_channels=[1, 2], reference_channel=0)
     pcm, out = np.rint(sound * 32768).astype("<i2"), []
     for at in range(0, len(pcm), 320):
         frame = through(ears, rtc.AudioFrame(pcm[at : at + 320].tobytes(), 16_000, 3, 320))

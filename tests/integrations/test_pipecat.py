@@ -86,7 +86,7 @@ def test_a_stereo_microphone_stays_stereo(filters):
 
 def test_the_loopback_of_the_device_is_the_reference_where_it_is_named(talking):
     profile, sound = talking
-    ears = EgoFilters(EgoFilter(profile, "linear"), in_channels=3, mic_channels=[1, 2], reference_channel=0)
+    ears = EgoFilters(EgoFilter(profile, engine="linear"), in_channels=3, mic_channels=[1, 2], reference_channel=0)
     pcm = np.rint(sound * 32768).astype("<i2")
     heard = []
 
@@ -110,7 +110,7 @@ def test_the_loopback_of_the_device_is_the_reference_where_it_is_named(talking):
 
     asyncio.run(asyncio.wait_for(listen(), 120))
     both, out = pcm.astype(np.float32) / 32768, np.concatenate(heard)
-    expected = EgoFilter(profile, "linear").process(both[:, 1:], both[:, 0])
+    expected = EgoFilter(profile, engine="linear").process(both[:, 1:], both[:, 0])
     np.testing.assert_allclose(out, expected[: out.size], atol=1 / 32768)
     part = slice(16_000, 32_000)
     assert np.mean(out[part] ** 2) < 0.01 * np.mean(both[part, 1] ** 2), "nothing was handed to the loudspeaker"
@@ -147,7 +147,7 @@ async def confidences(room_of, filters, switched_off_s):
 
 @pytest.mark.parametrize("switched_off_s", [6.0, 2.0, 0.2], ids=["never", "while the human speaks", "before"])
 def test_the_voice_activity_is_the_human_s_also_while_the_filter_is_switched_off(room_of, switched_off_s):
-    filters = EgoFilters(EgoFilter(room_of.PROFILE, "crnn"))
+    filters = EgoFilters(EgoFilter(room_of.PROFILE, engine="crnn"))
     found = asyncio.run(confidences(room_of, filters, switched_off_s))
     assert not found[:50].any() and found[90:160].all(), "0.2 s to notice were seen"
     assert not found[220:].any(), "0.5 s of pause end it"
@@ -210,7 +210,7 @@ class Recogniser(SegmentedSTTService):
 def test_a_segmented_recogniser_gets_the_finished_turn_of_an_array(pair):
     profile, sound = pair
     events = []
-    filters = EgoFilters(EgoFilter(profile, "crnn"), in_channels=3, mic_channels=[1, 2], on_event=events.append)
+    filters = EgoFilters(EgoFilter(profile, engine="crnn"), in_channels=3, mic_channels=[1, 2], on_event=events.append)
     recogniser = Recogniser()
 
     async def converse():

@@ -185,7 +185,7 @@ def test_of_an_array_the_named_channels_are_its_microphones_and_the_human_is_one
         assert process.wait(20) == 0
     human = np.frombuffer(heard, "<i2") / 32768
     assert 2.5 * RATE < human.size < len(pcm)
-    ego = EgoFilter(profile, "ss", barge_in=BargeInSettings(judge="network"))
+    ego = EgoFilter(profile, engine="ss", barge_in=BargeInSettings(judge="network"))
     played = pcm[:, 0] / np.float32(32768) if loopback else np.zeros(len(pcm), np.float32)
     wanted = ego.process(pcm[:, 1:] / np.float32(32768), played)
     np.testing.assert_allclose(human, wanted[: human.size], atol=1 / 32768)

@@ -56,7 +56,7 @@ def as_float(data):
 @asynccontextmanager
 async def serving(engine="crnn", profile=DEMO / "profile.npz", streams=4, token=None):
     """The address of a service, which is ended afterwards."""
-    service = Service(lambda learns, output: EgoFilter(profile, engine, output=output), streams, 0, token)
+    service = Service(lambda learns, output: EgoFilter(profile, engine=engine, output=output), streams, 0, token)
     async with served(service) as address:
         yield address
 
@@ -134,7 +134,7 @@ def test_a_stereo_stream_is_filtered_as_a_file_is_and_the_human_is_told(conversa
     mic, ref, human = conversation
     sound, told = run(heard({"rate": RATE}, stereo_messages(mic, ref)))
     out = as_float(b"".join(sound))
-    ego = EgoFilter(DEMO / "profile.npz", "crnn")
+    ego = EgoFilter(DEMO / "profile.npz", engine="crnn")
     expected = np.concatenate((ego.process(as_float(pcm(mic)), as_float(pcm(ref))), ego.flush()))
     np.testing.assert_allclose(out, expected, atol=1 / 32768)
     assert si_sdr(mic[BOTH], human[BOTH]) < -20 and si_sdr(out[BOTH], human[BOTH]) > 6  # 9.4 dB were seen
@@ -146,7 +146,7 @@ def test_a_stereo_stream_is_filtered_as_a_file_is_and_the_human_is_told(conversa
 def test_a_client_gets_the_sound_that_it_asks_for(conversation):
     mic, ref = (x[: 2 * RATE] for x in conversation[:2])
     sound, _ = run(heard({"output": "listen"}, stereo_messages(mic, ref)))
-    expected = enhance(as_float(pcm(mic)), as_float(pcm(ref)), DEMO / "profile.npz", "crnn", output="listen")
+    expected = enhance(as_float(pcm(mic)), as_float(pcm(ref)), DEMO / "profile.npz", engine="crnn", output="listen")
     np.testing.assert_allclose(as_float(b"".join(sound)), expected, atol=1 / 32768)
 
 
@@ -180,7 +180,7 @@ def test_the_microphones_of_an_array_are_filtered_as_they_are_in_a_file(pair, st
     messages = labelled(mic, ref) if streams == "two" else stereo_messages(mic, ref)
     hello = {"streams": streams, "microphones": 2}
     answers, told = run(heard(hello, messages, engine="ss", profile=profile))
-    ego = EgoFilter(profile, "ss")
+    ego = EgoFilter(profile, engine="ss")
     wanted = np.concatenate((ego.process(as_float(pcm(mic)).reshape(-1, 2), ref), ego.flush()))
     np.testing.assert_allclose(as_float(b"".join(answers)), wanted, atol=1 / 32768)
     assert told[-1]["kind"] == "ended" and told[-1]["array"] == ego.stats()["array"]

@@ -288,7 +288,7 @@ def test_the_loopback_of_the_device_is_the_reference_where_it_is_named(talking, 
         "while True: say(bytes(1920))"
     )
     ports = [f"tcp://127.0.0.1:{free_port(2) + at}" for at in range(2)]
-    heard, ego = [], EgoFilter(profile, "linear")
+    heard, ego = [], EgoFilter(profile, engine="linear")
     microphone = f'{sys.executable} -c "{code}"'
     form = AudioFormat(RATE, 2, 3)
 
@@ -465,7 +465,7 @@ def test_whoever_has_the_microphone_recognised_gets_the_words_of_the_finished_tu
         recogniser, microphones = AsyncServer.from_uri(ports[3]), AsyncServer.from_uri(ports[4])
         await recogniser.start(Recogniser)
         await microphones.start(partial(Microphones, sound))
-        ego = EgoFilter(profile, "crnn")
+        ego = EgoFilter(profile, engine="crnn")
         service = EgoService(ports[4], "true", ego, mic_channels=[1, 2], recogniser=ports[3])
         service.duplex.listeners.append(lambda event: turns.append(event.turn) if event.turn else None)
         serving = asyncio.create_task(service.run(*ports[:3]))

@@ -18,7 +18,7 @@ def test_of_a_loudspeaker(what: str, tmp_path) -> None:
     learner = PathLearner(remember=file)
     before = Scene(8.0, moved=4).part(4.0, 8.0)
     profile = self_calibrate(before.mic, before.reference) if what == "elsewhere" else None
-    with EgoFilter(profile, "linear", learn=learner) as ego:
+    with EgoFilter(profile, engine="linear", learn=learner) as ego:
         out = ego.process(scene.mic, scene.reference)
         events = [(one.kind, one.sample, one.detail) for one in ego.events()]
     known = Profile.load(file) if file.exists() else None

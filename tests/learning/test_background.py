@@ -179,7 +179,7 @@ def test_effects_of_the_users_own_are_known_there_and_may_print(short, tmp_path)
     echo = EchoModel(np.pad(room(2), (64, 0)), ((name, {"factor": 0.5}),))
     profile = Profile(echo, 1200.0, flat, silence, np.array([[900.0, 1100.0]]), np.array([40.0]), np.full(4, -50.0))
     learner = BackgroundLearner(profile)
-    ego = EgoFilter(profile, "linear", learn=learner)
+    ego = EgoFilter(profile, engine="linear", learn=learner)
     feed(ego, learner, short)
     ego.close()
     assert learner.stats()["hops"] == short.mic.size // HOP

@@ -11,7 +11,7 @@ from tests.learning.scenes import Scene
 
 
 def run(scene, learner=None, block=4096, profile=None):
-    ego = EgoFilter(profile, "linear", learn=learner)
+    ego = EgoFilter(profile, engine="linear", learn=learner)
     out = [
         ego.process(scene.mic[at : at + block], scene.reference[at : at + block])
         for at in range(0, scene.mic.size, block)
@@ -117,7 +117,7 @@ def test_what_was_learned_is_better_to_begin_with_than_nothing(alone, taught):
     profile = Profile.load(taught[-1])
     assert profile.learned
     begin = slice(0, 3 * SAMPLE_RATE)
-    cold, known = (enhance(alone.mic, alone.reference, p, "linear")[begin] for p in (None, profile))
+    cold, known = (enhance(alone.mic, alone.reference, p, engine="linear")[begin] for p in (None, profile))
     assert db(known) < db(cold) - 3.0
 
 

@@ -10,7 +10,7 @@ import soundfile
 from edgefilter.echo.model import EchoModel
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE
 from tests.diagnosis.robot_scene import profile, record, voice
-from tests.live.test_run_live import ROOT, edgefilter
+from tests.live.program import ROOT, edgefilter
 
 pytestmark = pytest.mark.slow
 

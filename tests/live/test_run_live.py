@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,15 +14,9 @@ import soxr
 
 from edgefilter import Profile
 from tests.learning.scenes import Scene
+from tests.live.program import DEMO, ROOT, edgefilter
 
 pytestmark = pytest.mark.slow
-
-ROOT = Path(__file__).parents[2]
-DEMO = ROOT / "edgefilter/demo_data"
-
-
-def edgefilter(*arguments):
-    return [sys.executable, "-m", "edgefilter.cli", *map(str, arguments)]
 
 
 @pytest.fixture(scope="module")

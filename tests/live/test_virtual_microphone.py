@@ -8,7 +8,7 @@ import pytest
 import soundfile
 
 from edgefilter.cli import main
-from tests.live.test_run_live import DEMO, ROOT, edgefilter
+from tests.live.program import DEMO, ROOT, edgefilter
 
 pytestmark = pytest.mark.slow
 
