@@ -43,7 +43,7 @@ class LiveSource(Source):
         opened = self._mic.port.wanted
         self.microphones = 1 if opened is None else len(opened) - self._both
         self._reference = None if reference is None else SteadyInput(_opener(reference), patience_s)
-        self._pairing = Pairing(not isinstance(reference, SpokenReference), self.microphones)
+        self._pairing, self._followed, self._drift = Pairing(), (0, 0), 0
         self.notes = [f"microphone: {self._mic.port.device}", *self._mic.port.notes]
         there = self._mic.port.device.inputs
         if opened is None and 1 < there <= MOST_MICROPHONES:
@@ -79,8 +79,9 @@ class LiveSource(Source):
         that slept, and reference that never came, which is filled or inserted as silence. An overrun may hide an unknown
         number of samples.
         """
-        counts = {f"reference_{name}": getattr(self._pairing, name) for name in ("filled", "dropped", "inserted")}
-        replaced = {"microphone": 0, "reference": self._pairing.filled + self._pairing.inserted}
+        counts = {"reference_filled": self._pairing.filled, "reference_inserted": self._pairing.inserted}
+        replaced = {"microphone": 0, "reference": sum(counts.values())}
+        counts["reference_dropped"] = self._pairing.skipped
         times: dict[str, int] = {}
         for name, each in (("microphone", self._mic), ("reference", self._reference)):
             counts[f"{name}_lost"] = each.lost + max(each.missed - replaced[name], 0) if each else 0
@@ -90,48 +91,72 @@ class LiveSource(Source):
         return {"lost": max(missing), **counts, **times}
 
     def __iter__(self) -> Iterator[Block]:
-        reported = 0
+        start = reported = 0
         failure: DeviceError | None = None
         self._synchronise()
         while not self._stopped:
-            blocks = [self._take()]
+            count = self._receive()
             try:
                 for each in self._inputs():
                     each.check()
             except DeviceError as error:
                 failure = error
-                blocks.append(self._pairing.flush())
-            for block in filter(None, blocks):
+                count = len(self._pairing.mic)
+            if count:
+                mic, ref = self._pairing.pair(count)
                 before, reported = reported, self.stats()["lost"]
-                yield Block(block.mic, block.ref, block.start, reported - before)
+                yield Block(mic, ref, start, reported - before)
+                start += count
             if failure is not None:
                 raise failure
-            if blocks == [None]:
+            if not count:
                 pause()
 
-    def _take(self) -> Block | None:
-        """What came of both devices, as far as it can be paired."""
-        mic = self._mic.take()
+    def _receive(self) -> int:
+        """Take what came of both devices; how many samples of the microphone can be paired."""
+        mic, silence = self._mic.take(), 0
+        ref = np.zeros(len(mic), np.float32)
         if self._both:
-            heard = mic[:, :-1] if self.microphones > 1 else mic[:, 0]
-            return self._pairing.push(heard, mic[:, -1])
-        if self._reference is None:
-            return self._pairing.push(mic, np.zeros(len(mic), np.float32))
-        before = self._reference.filled
-        ref = self._reference.take()
-        return self._pairing.push(mic, ref, self._reference.filled - before)
+            mic, ref = mic[:, :-1] if self.microphones > 1 else mic[:, 0], mic[:, -1]
+        if self._reference is not None:
+            before = self._reference.filled
+            ref = self._reference.take()
+            silence = self._reference.filled - before
+        self._pairing.hear(mic)
+        self._pairing.play(ref, silence)
+        held = self._reference is not None and any(each.doubts for each in self._inputs())
+        if self._reference is not None and not held:
+            self._follow(self._reference)
+        waiting = len(self._pairing.mic)
+        return max(0 if held else min(waiting, self._pairing.known), waiting - MAX_WAIT)
+
+    def _follow(self, reference: SteadyInput) -> None:
+        """Keep the reference in step with the microphone, by what either of them lost and by how far their clocks have drifted."""
+        drift = reference.drifted - self._mic.drifted
+        if abs(drift - self._drift) > TOLERANCE:
+            self._drift = drift
+        now = self._mic.missed, reference.missed + self._drift
+        heard, played = (new - old for new, old in zip(now, self._followed))
+        self._followed, ahead = now, heard - played
+        if ahead > 0:
+            self._pairing.skip(ahead)
+        elif heard < 0:
+            self._pairing.put_back(-ahead)
+        else:
+            self._pairing.move(ahead)
 
     def _synchronise(self) -> None:
         """Wait until both devices run steadily, and begin with what arrives then: a stream may stall right after its start.
 
         The reference is emptied last: one that is too old would come before its echo, one that is too new only adds delay.
         """
-        while not self._stopped and not all(each.settled * SAMPLE_RATE >= MAX_WAIT for each in self._inputs()):
-            for each in self._inputs():
-                each.port.check_alive(each.port.inlet.received, START_S)
+        ports = [each.port for each in self._inputs()]
+        while not self._stopped and any(port.inlet.received / port.rate < MAX_WAIT / SAMPLE_RATE for port in ports):
+            for port in ports:
+                port.check_alive(port.inlet.received, START_S)
             pause()
-        for each in reversed(self._inputs()):
-            each.port.take()
+        for port in reversed(ports):
+            port.take()
 
 
 def _opener(

@@ -1,4 +1,4 @@
-"""Two devices, two clocks, one sample counter: what a microphone and a reference delivered, as blocks."""
+"""A microphone and its reference on one sample counter, and the rings between them and the audio callbacks."""
 
 from __future__ import annotations
 
@@ -7,17 +7,15 @@ from collections import deque
 import numpy as np
 
 from edgefilter.dsp.ring import Ring
-from edgefilter.types import SAMPLE_RATE, Block, Samples
+from edgefilter.types import SAMPLE_RATE, Samples
 
 MAX_WAIT = SAMPLE_RATE // 4
 """Samples for which the microphone waits for a reference that is late, before silence stands in for it."""
 TOLERANCE = SAMPLE_RATE // 50
-"""Samples by which the two counters may differ for good: one callback of 20 ms, which come in any phase."""
+"""Samples by which the counters of two devices may drift apart before they meet again: one callback of 20 ms."""
 BUFFER_S = 2.0
 """How much sound a ring holds while the filter is busy; beyond it samples are lost, and counted. A device that delivers
-nothing for as long has stopped."""
-WINDOW = round(BUFFER_S * SAMPLE_RATE)
-"""Samples: a difference counts as lasting when it was never smaller for so long; a busy machine catches up sooner."""
+nothing for as long has stopped. As much of the reference is kept to be used again where sound that seemed lost comes after all."""
 
 
 class Inlet:
@@ -25,7 +23,7 @@ class Inlet:
 
     The callback calls `receive`; the reader calls `take`, which puts silence where samples are missing, so that
     the sample counter stays true. channels: samples are then (n, channels) in place of (n,). lost: samples that did not
-    fit. flags: callbacks that the driver marked as overrun.
+    fit. flags: callbacks that the driver marked as overrun. latest: what was received when samples last came, and that time, s.
     """
 
     def __init__(self, capacity: int, channels: int | None = None) -> None:
@@ -34,6 +32,7 @@ class Inlet:
         self._stored = 0
         self._read = 0
         self.flags = 0
+        self.latest = (0, 0.0)
 
     @property
     def lost(self) -> int:
@@ -42,15 +41,16 @@ class Inlet:
     @property
     def received(self) -> int:
         """Samples that the device delivered so far, lost ones included."""
-        return self._stored + self._ring.lost
+        return self.latest[0]
 
-    def receive(self, samples: Samples, flagged: bool = False) -> None:
-        """Called by the audio thread with (n,) samples."""
+    def receive(self, samples: Samples, flagged: bool = False, at: float = 0.0) -> None:
+        """Called by the audio thread with (n,) samples, at this time."""
         count = self._ring.write(samples)
         self._stored += count
         if count < len(samples):
             self._gaps.append((self._stored, len(samples) - count))
         self.flags += flagged
+        self.latest = (self.latest[0] + len(samples), at)
 
     def take(self) -> Samples:
         """Everything that arrived since the last call, (n,) float32, gaps filled with silence."""
@@ -67,79 +67,77 @@ class Inlet:
 
 
 class Pairing:
-    """Pairs microphone and reference samples; every sample of the microphone, whose counter is the master, comes out.
+    """Pairs microphone and reference: each sample of the microphone, whose counter is the master, takes one of the reference.
 
-    It waits for its reference. After MAX_WAIT samples silence stands in (`filled`), and what arrives late for those
-    places is discarded, so that a stall does not shift the reference. If the counters differ by more than TOLERANCE
-    throughout WINDOW, the clocks differ or a driver lost samples: the reference is cut (`dropped`) or extended with
-    silence (`inserted`) to meet the counter again. late_is_lost: False where the reference is what is played here:
-    after a stall it is not late but played later, so that nothing of it is discarded.
+    Both wait here until they are paired. late_is_lost: whether reference that comes after silence has stood in for it is
+    discarded, so that the rest is not shifted; otherwise it is played later. queued: samples of the reference that wait.
+    played: those that were paired; filled, inserted: silence in place of those that did not come in time, or never; skipped:
+    those whose time the microphone has lost; dropped: those that were never played.
     """
 
-    def __init__(self, late_is_lost: bool = True, microphones: int = 1) -> None:
+    def __init__(self, late_is_lost: bool = True) -> None:
         self._late_is_lost = late_is_lost
-        self._mic = np.zeros(0 if microphones == 1 else (0, microphones), np.float32)
-        self._ref = np.zeros(0, np.float32)
-        self._debt = 0
-        self._next = 0
-        self._smallest: int | None = None
-        self._watched = 0
-        self.filled = self.dropped = self.inserted = 0
+        self.mic, self._ref = np.zeros(0, np.float32), np.zeros(0, np.float32)
+        self._came: list[Samples] = []
+        self._at = self._debt = self.queued = 0
+        self.played = self.filled = self.inserted = self.skipped = self.dropped = 0
 
-    def push(self, mic: Samples, ref: Samples, silence: int = 0) -> Block | None:
-        """Take what arrived, (n,), or (n, channels) of an array, and (m,), and return the block that is complete, if any.
+    @property
+    def known(self) -> int:
+        """Samples of the microphone whose reference is there, or is known to be lost."""
+        return max(self.queued - self._debt, 0)
 
-        silence: so many of ref, the first ones, stand in for a device that is away; the caller counts them.
-        """
-        late = min(self._debt, ref.size)
-        self._debt -= late
-        self.filled -= min(late, silence)
-        self._mic = np.concatenate((self._mic, mic))
-        self._ref = np.concatenate((self._ref, ref[late:]))
-        lost = self.filled + self.dropped + self.inserted
-        self._watch(len(mic))
-        missing = len(self._mic) - self._ref.size - MAX_WAIT
-        if missing > 0:
-            self._debt += missing * self._late_is_lost
-            self.filled += self._extend(missing)
-        return self._emit(min(len(self._mic), self._ref.size), self.filled + self.dropped + self.inserted - lost)
+    def hear(self, mic: Samples) -> None:
+        """Take what the microphone brings next, (n,), or (n, channels) of an array."""
+        self.mic = np.concatenate((self.mic, mic)) if len(self.mic) else mic.copy()
 
-    def flush(self) -> Block | None:
-        """The microphone samples still waiting; silence stands in for their reference."""
-        missing = self._extend(max(0, len(self._mic) - self._ref.size))
-        self.filled += missing
-        return self._emit(len(self._mic), missing)
+    def play(self, ref: Samples, silence: int = 0) -> None:
+        """Take the reference that follows, (n,); the first `silence` samples, which the caller counts, stand in for a device."""
+        if ref.size:
+            self._came.append(ref.copy())
+        self.queued += ref.size
+        self.filled -= min(self.move(0).size, silence)
 
-    def _extend(self, count: int) -> int:
-        """Put so much silence behind the reference."""
-        self._ref = np.concatenate((self._ref, np.zeros(count, np.float32)))
-        return count
+    def pair(self, count: int) -> tuple[Samples, Samples]:
+        """The first count samples of the microphone, and their reference, (n,), with silence where that lacks."""
+        mic, self.mic = self.mic[:count], self.mic[count:]
+        inserted = min(max(-self._debt, 0), count)
+        ref = self._take(count - inserted if self._debt <= 0 else 0)
+        filled = count - inserted - ref.size
+        self.played, self.filled, self.inserted = self.played + ref.size, self.filled + filled, self.inserted + inserted
+        self._debt += inserted + filled * self._late_is_lost
+        return mic, np.concatenate((np.zeros(inserted, np.float32), ref, np.zeros(filled, np.float32)))
 
-    def _emit(self, count: int, lost: int) -> Block | None:
-        if count == 0:
-            return None
-        block = Block(self._mic[:count], self._ref[:count], self._next, lost)
-        self._mic, self._ref = self._mic[count:], self._ref[count:]
-        self._next += count
-        return block
+    def skip(self, count: int) -> Samples:
+        """Go on by what was played, (n,), while the microphone lost so many samples; empty until all of it is there."""
+        self.skipped += count
+        return self.move(count)
 
-    def _watch(self, arrived: int) -> None:
-        """Follow the smallest difference of the counters (reference ahead: positive), and act on one that lasts."""
-        skew = self._ref.size - len(self._mic) - self._debt
-        before = self._smallest
-        if before is None or abs(skew) < abs(before) or (skew > 0) != (before > 0):
-            self._smallest = skew if before is None or (skew > 0) == (before > 0) else 0
-        self._watched += arrived
-        if self._watched < WINDOW:
-            return
-        lasting, self._smallest, self._watched = self._smallest or 0, None, 0
-        if lasting > TOLERANCE:
-            self._ref = self._ref[lasting:]
-            self.dropped += lasting
-        elif lasting < -TOLERANCE:
-            forgiven = min(self._debt, -lasting)
-            self._debt -= forgiven
-            self.inserted += self._extend(-lasting - forgiven)
+    def put_back(self, count: int) -> None:
+        """Go back by so many samples of those skipped: what they are to be paired with was late, not lost."""
+        count = min(count, self.skipped, self._at)
+        self._at, self.queued, self.skipped = self._at - count, self.queued + count, self.skipped - count
+
+    def drop(self, count: int) -> None:
+        """Leave out so many samples of the reference, which are not played."""
+        self.dropped += self._take(count).size
+        self._ref, self._at = self._ref[self._at :], 0
+
+    def move(self, by: int) -> Samples:
+        """Go on by so many samples of the reference, (n,), once all of them have come; back, by silence that stands in for them."""
+        self._debt += by
+        late = self._take(self._debt if 0 < self._debt <= self.queued else 0)
+        self._debt -= late.size
+        return late
+
+    def _take(self, count: int) -> Samples:
+        if count > self._ref.size - self._at:
+            kept = min(self._at, round(BUFFER_S * SAMPLE_RATE))
+            self._ref, self._came = np.concatenate((self._ref[self._at - kept :], *self._came)), []
+            self._at = kept
+        taken = self._ref[self._at : self._at + count]
+        self._at, self.queued = self._at + taken.size, self.queued - taken.size
+        return taken
 
 
 class Outlet:

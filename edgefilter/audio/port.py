@@ -184,7 +184,7 @@ class InputPort(Port):
         inlet, wanted = self.inlet, self.wanted
 
         def callback(indata: np.ndarray, _frames: int, _time: Any, status: Any) -> None:
-            inlet.receive(delivered(indata, wanted), bool(status.input_overflow))
+            inlet.receive(delivered(indata, wanted), bool(status.input_overflow), clock())
 
         self.start(callback)
 
@@ -247,7 +247,7 @@ class SpokenReference(Port):
         def callback(outdata: np.ndarray, _frames: int, _time: Any, status: Any) -> None:
             played = self._next(len(outdata))
             outdata[:] = played[:, None]
-            self.inlet.receive(played, bool(status.output_underflow))
+            self.inlet.receive(played, bool(status.output_underflow), clock())
 
         self.start(callback)
 

@@ -11,14 +11,14 @@ import numpy as np
 from edgefilter.audio.pairing import BUFFER_S
 from edgefilter.audio.port import START_S, InputPort, SpokenReference, clock
 from edgefilter.audio.protocols import Sink
-from edgefilter.audio.sample_clock import SampleClock
+from edgefilter.audio.sample_clock import HELD_S, SampleClock
 from edgefilter.errors import DeviceError
 from edgefilter.types import SAMPLE_RATE, Samples
 
 RETRY_S = 1.0
 """Between two attempts to open a device that is away."""
-LOOK_S = 3 * BUFFER_S
-"""How long sound may be late before it counts as lost: a pairing that can replace it needs up to two of its windows."""
+LOOK_S = 0.5
+"""How long a small delay must last to count as lost sound: longer than callbacks are late on a busy machine."""
 
 
 class SteadyInput:
@@ -33,7 +33,7 @@ class SteadyInput:
         self._make, self._patience_s = make, patience_s
         self.port = make()
         self.filled = self.gone = self.back = 0
-        self._earlier_lost = self._earlier_missed = self._earlier_overruns = 0
+        self._earlier_lost = self._earlier_overruns = 0
         self._open, self._clock = False, SampleClock(LOOK_S)
         self._failure: DeviceError | None = None
         self._latest = np.zeros(0, np.float32)
@@ -50,19 +50,24 @@ class SteadyInput:
         self._open = False
 
     @property
-    def settled(self) -> float:
-        """Seconds of sound that have come since the device was opened."""
-        return self.port.inlet.received / self.port.rate
-
-    @property
     def lost(self) -> int:
         """Samples at 16 kHz that did not fit into the ring: silence stands in."""
         return self._earlier_lost + round(self.port.inlet.lost / self.port.rate * SAMPLE_RATE)
 
     @property
+    def doubts(self) -> bool:
+        """Whether sound is late, so that it is not clear yet what was lost."""
+        return self._clock.doubt_s > HELD_S or clock() - self._received_at > HELD_S
+
+    @property
     def missed(self) -> int:
         """Samples at 16 kHz that never came: nothing stands in."""
-        return self._earlier_missed + round(self._clock.missed * SAMPLE_RATE)
+        return round(self._clock.missed * SAMPLE_RATE)
+
+    @property
+    def drifted(self) -> int:
+        """Samples at 16 kHz by which the device's clock has fallen behind besides."""
+        return round(self._clock.drifted * SAMPLE_RATE)
 
     @property
     def overruns(self) -> int:
@@ -75,8 +80,9 @@ class SteadyInput:
         samples = self.port.take() if self._open else self._latest[:0]
         self._latest = samples
         if self._failure is None:
-            self._received_at = now if len(samples) else self._received_at
-            self._clock.note(self.settled, now)
+            if len(samples):
+                received, self._received_at = self.port.inlet.latest
+                self._clock.note(received / self.port.rate, self._received_at)
             return samples
         missing = max(round((now - self._received_at) * SAMPLE_RATE) - len(samples), 0)
         silence = np.zeros((missing, *samples.shape[1:]), np.float32)
@@ -99,6 +105,7 @@ class SteadyInput:
             self.close()
             if self._failure is None:
                 self._failure, self._gone_at = error, self._received_at
+                self._clock.restart()
                 self.gone += 1
         now = clock()
         if self._failure and not self._open and now - self._tried_at >= RETRY_S:
@@ -116,10 +123,9 @@ class SteadyInput:
             if port:
                 port.close()
             return
-        self._earlier_missed = self.missed
         if port is not self.port:
             self._earlier_lost, self._earlier_overruns = self.lost, self.overruns
-        self.port, self._clock, self._open = port, SampleClock(LOOK_S), True
+        self.port, self._open = port, True
 
 
 class SteadySink(Sink):

@@ -17,8 +17,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from edgefilter.audio.pairing import Pairing
 from edgefilter.audio.raw import delivered, of_pcm16, to_pcm16
-from edgefilter.audio.sample_clock import SampleClock
+from edgefilter.audio.sample_clock import HELD_S, SampleClock
 from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import UsageError
 from edgefilter.filter.barge_in import BargeInSettings
@@ -29,14 +30,8 @@ from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, SET_UP_WRONG, Event,
 
 MOST_QUEUED_S = WAITING_S
 """Speech that may wait to be played, as much as turns may wait: longer than any answer. The rest is refused and counted."""
-LOOK_S, STALL_S = 0.15, 0.25
-"""How long a small delay of the microphone must last to count as lost sound, longer than transports of 100 ms are quiet; and
-a delay that counts after a tenth of that: a program that stood still for so long finds all that it has missed waiting."""
-WAITED_S, HELD_S = 1e-3, 0.1
-"""WAITED_S: least gap between two calls, in seconds, that shows that the caller has no backlog; one that is behind calls again
-at once. HELD_S: a delay from which on the microphone's samples are buffered until it is clear whether some were lost."""
-BACK_S = 2.0
-"""Seconds of reference that are kept, to be used again where sound that seemed lost comes after all."""
+WAITED_S = 1e-3
+"""Least gap between two calls, in seconds, that shows that the caller has no backlog; one that is behind calls again at once."""
 FILLED_S = 1.0
 """Most of it that is filled with silence at once, which takes 0.1 to 0.3 s to compute: more than rooms and buffers hold back."""
 PATIENCE_S = 0.12
@@ -121,15 +116,12 @@ class Duplex:
         self._patience = 0 if self._both else round(patience_s * SAMPLE_RATE)
         self._on_event, self._clock = on_event, clock
         self._queue_lock, self._hear_lock = threading.Lock(), threading.Lock()
-        self._queue: deque[Samples] = deque()
-        self._queued = self._gaps = self.heard = 0
-        self._samples = dict.fromkeys(("played", "dropped", "unheard", "refused"), 0)
+        self._pairing = Pairing(late_is_lost=False)
+        self._gaps = self._refused = self.heard = 0
         self._from_agent = Resampler(SAMPLE_RATE, SAMPLE_RATE)
         self._from_mic, self._to_agent = (Resampler(SAMPLE_RATE, SAMPLE_RATE) for _ in range(2))
-        self._mic = np.zeros(0, np.float32)
         self._pace = Pace(clock)
-        self._losses, self._delivered_s, self._timed = SampleClock(LOOK_S, STALL_S), 0.0, False
-        self._taken: deque[Samples] = deque()
+        self._losses, self._delivered_s, self._timed = SampleClock(), 0.0, False
         self._unheard, self._came = np.zeros(0, np.float32), np.zeros(0, bool)
         self._kept: deque[Event] = deque(maxlen=1000)
         self.enabled = True
@@ -164,7 +156,7 @@ class Duplex:
         """Drop the speech that has not been played: the robot fell silent in mid-word."""
         with self._queue_lock:
             self._from_agent = Resampler(*self._from_agent.rates)
-            self._take(self._queued, "dropped")
+            self._pairing.drop(self._pairing.queued)
             self._talking = False
 
     def pause(self) -> None:
@@ -174,7 +166,7 @@ class Duplex:
     def resume(self, skipped_s: float = 0.0) -> None:
         """Go on after a pause; skipped_s: how much of the speech that waits the loudspeaker leaves out."""
         with self._queue_lock:
-            self._take(round(skipped_s * SAMPLE_RATE), "dropped")
+            self._pairing.drop(round(skipped_s * SAMPLE_RATE))
             self._paused = False
 
     def hear(self, samples: Samples, rate: int, at_s: float | None = None) -> Samples:
@@ -193,12 +185,10 @@ class Duplex:
             channels = 1 if samples.ndim == 1 else samples.shape[1]
             if self._from_mic.rates[0] != rate or self._from_mic.channels != channels:
                 self._from_mic, self._to_agent = Resampler(rate, SAMPLE_RATE, channels), Resampler(SAMPLE_RATE, rate)
-            pushed = self._from_mic.push(samples)
-            self._mic = np.concatenate((self._mic, pushed)) if len(self._mic) else pushed
             with self._queue_lock:
+                self._pairing.hear(self._from_mic.push(samples))
                 self._follow_losses(len(samples) / rate, at_s)
-                reference = self._reference()
-            mic, self._mic = self._mic[: reference.size], self._mic[reference.size :]
+                mic, reference = self._paired()
             if self._both:
                 mic, reference = mic[:, :-1], mic[:, -1]
             human = self._filter(mic, reference)
@@ -256,14 +246,16 @@ class Duplex:
     @property
     def queued_s(self) -> float:
         """Seconds of speech that wait to be played."""
-        return self._queued / SAMPLE_RATE
+        return self._pairing.queued / SAMPLE_RATE
 
     def stats(self) -> dict[str, float]:
         """Seconds of speech: played_s, queued_s, dropped_s, unheard_s (the microphone was off), refused_s; and gaps.
 
         gaps: how often speech ran out, at its end unless the agent calls `end`, or within it.
         """
-        seconds = {f"{what}_s": count / SAMPLE_RATE for what, count in self._samples.items()}
+        now = self._pairing
+        counts = {"played": now.played, "dropped": now.dropped, "unheard": now.skipped, "refused": self._refused}
+        seconds = {f"{what}_s": count / SAMPLE_RATE for what, count in counts.items()}
         return {**seconds, "queued_s": self.queued_s, "gaps": self._gaps}
 
     def close(self) -> None:
@@ -294,20 +286,22 @@ class Duplex:
         elif deaf and not self._deaf:
             _LOGGER.warning("engine %s judges speech: the human is noticed again", self.ego.engine_name)
 
-    def _reference(self) -> Samples:
-        """What was played while the waiting samples of the microphone were recorded; shorter where they wait on."""
-        count = 0 if self._held else len(self._mic)
+    def _paired(self) -> tuple[Samples, Samples]:
+        """The samples of the microphone that need not wait, and what was played while they were recorded."""
+        pairing, count = self._pairing, len(self._pairing.mic)
         if self._paused:
-            return np.zeros(count, np.float32)
-        if self._talking and count > self._queued:
-            if count - self._queued <= self._patience:
-                count = self._queued
+            mic, pairing.mic = pairing.mic, pairing.mic[:0]
+            return mic, np.zeros(count, np.float32)
+        if self._held:
+            count = 0
+        elif self._talking and count > pairing.queued:
+            if count - pairing.queued <= self._patience:
+                count = pairing.queued
             else:
                 self._finish()
                 self._talking = False
                 self._gaps += 1
-        taken = self._take(count, "played")
-        return taken if taken.size == count else np.concatenate((taken, np.zeros(count - taken.size, np.float32)))
+        return pairing.pair(count)
 
     def _follow_losses(self, heard_s: float, at_s: float | None) -> None:
         """Skip what was played while the microphone's sound was lost, and take it back where that comes after all.
@@ -320,60 +314,26 @@ class Duplex:
         self._held = False
         if self._paused or (at_s is not None) != self._timed:
             self._timed = at_s is not None
-            self._losses = SampleClock(0.0 if self._timed else LOOK_S, STALL_S)
+            self._losses = SampleClock(0.0) if self._timed else SampleClock()
         elif waited or at_s is not None:
             lost_s = self._losses.note(self._delivered_s, now if at_s is None else at_s + heard_s)
             self._held = self._talking and self._losses.doubt_s > HELD_S
             if lost_s > 0.0:
                 count = round(min(lost_s, max(now - self._talking_since, 0.0)) * SAMPLE_RATE)
-                skipped = self._take(count, "unheard")[-round(FILLED_S * SAMPLE_RATE) :]
+                skipped = self._pairing.skip(min(count, self._pairing.queued))[-round(FILLED_S * SAMPLE_RATE) :]
                 self._unheard = skipped[:0] if self._both else skipped
             elif lost_s < 0.0:
-                self._put_back(min(round(-lost_s * SAMPLE_RATE), self._samples["unheard"]))
-
-    def _put_back(self, count: int) -> None:
-        """Let the latest count samples of the reference come again: what they are to be paired with was late, not lost."""
-        while count and self._taken:
-            part = self._taken.pop()
-            if part.size > count:
-                self._taken.append(part[:-count])
-                part = part[-count:]
-            self._queue.appendleft(part)
-            self._queued += part.size
-            self._samples["unheard"] -= part.size
-            count -= part.size
+                self._pairing.put_back(round(-lost_s * SAMPLE_RATE))
 
     def _append(self, samples: Samples) -> None:
-        fits = samples[: max(0, round(MOST_QUEUED_S * SAMPLE_RATE) - self._queued)]
-        self._samples["refused"] += samples.size - fits.size
-        if fits.size:
-            self._queue.append(fits)
-            self._queued += fits.size
+        fits = samples[: max(0, round(MOST_QUEUED_S * SAMPLE_RATE) - self._pairing.queued)]
+        self._refused += samples.size - fits.size
+        self._pairing.play(fits)
 
     def _finish(self) -> None:
         """Queue what the resampler holds back; speech that follows begins a new stream."""
         self._append(self._from_agent.push(np.zeros(0, np.float32), last=True))
         self._from_agent = Resampler(*self._from_agent.rates)
-
-    def _take(self, count: int, what: str) -> Samples:
-        """Take up to count samples from the queue and count them as what became of them."""
-        parts = []
-        while count and self._queue:
-            part = self._queue.popleft()
-            if part.size > count:
-                self._queue.appendleft(part[count:])
-                part = part[:count]
-            parts.append(part)
-            count -= part.size
-            self._queued -= part.size
-            self._samples[what] += part.size
-        if what == "dropped":
-            self._taken.clear()
-            return np.zeros(0, np.float32)
-        self._taken.extend(parts)
-        while self._taken and sum(part.size for part in self._taken) - self._taken[0].size > BACK_S * SAMPLE_RATE:
-            self._taken.popleft()
-        return np.concatenate(parts) if parts else np.zeros(0, np.float32)
 
 
 class Pace:

@@ -5,9 +5,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from edgefilter.audio.pairing import TOLERANCE, Pairing
+from edgefilter.audio.device import find
+from edgefilter.audio.live import LiveSource
+from edgefilter.audio.pairing import TOLERANCE
 from edgefilter.audio.port import FADE_S, SpokenReference
 from edgefilter.audio.pulse import Device
+from edgefilter.commands.run import limited
+from tests.audio.virtual_portaudio import VirtualDevice
 
 SPEECH = 0.5 * np.random.default_rng(3).standard_normal(48_000).astype(np.float32).clip(-1, 1)
 FINE = SimpleNamespace(output_underflow=False)
@@ -107,18 +111,15 @@ def test_a_device_of_another_rate_plays_all_of_it_and_is_read_at_16_khz():
 
 
 @pytest.mark.parametrize("stall_s", [0.1, 0.6])
-def test_speech_that_a_stalled_device_plays_later_is_in_the_reference_later_and_whole(stall_s):
+def test_speech_that_a_stalled_device_plays_later_is_in_the_reference_later_and_whole(plug, stall_s):
     """The counter of what is played stands still meanwhile; what comes after it was not late, it was played then."""
-    pairing = Pairing(late_is_lost=False)
-    spoken, blocks = np.arange(1, 16_000 * 8 + 1, dtype=np.float32), []
-    played, stalled = 0, range(16_000 * 2, 16_000 * 2 + round(16_000 * stall_s))
-    for at in range(0, 16_000 * 9, 160):
-        mic = np.zeros(160, np.float32)
-        step = 0 if at in stalled else 160
-        blocks.append(pairing.push(mic, spoken[played : played + step]))
-        played += step
-    reference = np.concatenate([block.ref for block in blocks if block])
-    kept = reference[reference > 0]
-    np.testing.assert_array_equal(kept, spoken[: kept.size])
-    late = np.flatnonzero(reference == 16_000 * 7)[0] - (16_000 * 7 - 1)
-    assert abs(late - 16_000 * stall_s) <= TOLERANCE
+    mic, speaker = VirtualDevice("mic", "input"), VirtualDevice("speaker", "output")
+    system = plug(mic, speaker)
+    spoken = np.arange(1, 16_000 * 8 + 1, dtype=np.float32) / 2**18
+    reference = SpokenReference(system, find("speaker", "output"), iter((spoken,)))
+    system.at(2.0, lambda: setattr(speaker, "swallows", stall_s))
+    with LiveSource("mic", reference) as source:
+        heard = np.concatenate([block.ref for block in limited(source, 9 * 16_000)])
+    np.testing.assert_array_equal(heard[heard > 0], spoken)
+    silent = np.flatnonzero(heard[: 8 * 16_000 + round(16_000 * stall_s)] == 0.0)
+    assert silent.size == pytest.approx(16_000 * stall_s, abs=TOLERANCE + 160) and np.ptp(silent) < 16_000

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from edgefilter.audio.device import match, monitor
-from edgefilter.audio.pairing import MAX_WAIT, TOLERANCE, WINDOW, Inlet, Outlet, Pairing
+from edgefilter.audio.pairing import MAX_WAIT, Inlet, Outlet, Pairing
 from edgefilter.audio.pulse import Device
 from edgefilter.audio.raw import PcmSink, PcmSource
 from edgefilter.errors import AudioFileError, DeviceError, SignalError, UsageError
@@ -181,43 +181,46 @@ def test_inlet_keeps_the_place_of_what_it_lost():
     inlet.receive(np.arange(1, 9, dtype=np.float32))
     inlet.receive(np.arange(9, 15, dtype=np.float32))
     np.testing.assert_array_equal(inlet.take(), [*range(1, 11), 0, 0, 0, 0])
-    inlet.receive(np.array([15.0], np.float32), flagged=True)
+    inlet.receive(np.array([15.0], np.float32), flagged=True, at=7.0)
     np.testing.assert_array_equal(inlet.take(), [15])
     assert inlet.lost == 4 and inlet.flags == 1 and inlet.received == 15
-
-
-def pair(mic_chunks, ref_chunks):
-    pairing, blocks = Pairing(), []
-    for mic, ref in zip(mic_chunks, ref_chunks):
-        block = pairing.push(mic, ref)
-        blocks += [] if block is None else [block]
-    joined = [np.concatenate([getattr(b, side) for b in blocks]) for side in ("mic", "ref")]
-    return pairing, blocks, *joined
+    assert inlet.latest == (15, 7.0)
 
 
 def ramp(count):
     return np.arange(1, count + 1, dtype=np.float32)
 
 
+def paired(pairing, mic_chunks, ref_chunks):
+    """Both, as far as they are paired by a microphone that waits for its reference as long as a device's does."""
+    parts = [(np.zeros(0, np.float32), np.zeros(0, np.float32))]
+    for mic, ref in zip(mic_chunks, ref_chunks):
+        pairing.hear(mic)
+        pairing.play(ref)
+        waiting = len(pairing.mic)
+        parts.append(pairing.pair(max(min(waiting, pairing.known), waiting - MAX_WAIT)))
+    return [np.concatenate(side) for side in zip(*parts)]
+
+
 def test_uneven_callbacks_pair_sample_for_sample():
     x = ramp(60000)
     cuts = np.sort(np.random.default_rng(3).integers(0, 60000, 99))
-    mic = np.split(x, cuts)
     ref = [np.zeros(0, np.float32), *np.split(x, cuts)[:-1]]  # always one callback behind
-    pairing, blocks, got_mic, got_ref = pair(mic, ref)
+    pairing = Pairing()
+    got_mic, got_ref = paired(pairing, np.split(x, cuts), ref)
     np.testing.assert_array_equal(got_mic, got_ref)
-    assert pairing.filled == pairing.dropped == pairing.inserted == 0
-    assert [b.start for b in blocks] == list(np.cumsum([0] + [b.mic.size for b in blocks[:-1]]))
+    np.testing.assert_array_equal(got_mic, x[: got_mic.size])
+    assert pairing.played == got_mic.size and pairing.filled == pairing.skipped == pairing.inserted == 0
 
 
 def test_a_stalled_reference_is_filled_and_its_late_samples_do_not_shift_the_rest():
     x = ramp(20 * 1000)
-    mic = np.split(x, 20)
     late = np.concatenate(np.split(x, 20)[5:12])
     ref = [late if i == 11 else part[:0] if 5 <= i < 11 else part for i, part in enumerate(np.split(x, 20))]
-    pairing, blocks, got_mic, got_ref = pair(mic, ref)
+    pairing = Pairing()
+    got_mic, got_ref = paired(pairing, np.split(x, 20), ref)
     np.testing.assert_array_equal(got_mic, x)
-    assert pairing.filled == 6000 - MAX_WAIT == sum(b.lost for b in blocks)
+    assert pairing.filled == 6000 - MAX_WAIT
     stood_in = slice(5000, 5000 + pairing.filled)
     assert not got_ref[stood_in].any()
     expected = x.copy()
@@ -225,20 +228,30 @@ def test_a_stalled_reference_is_filled_and_its_late_samples_do_not_shift_the_res
     np.testing.assert_array_equal(got_ref, expected)
 
 
-@pytest.mark.parametrize("ppm", [20000, -20000])
-def test_clocks_that_differ_stay_within_bounds_and_are_counted(ppm):
-    count = 60
-    ref_size = 1600 + 1600 * ppm // 1000000
-    pairing, blocks, got_mic, got_ref = pair(
-        [np.ones(1600, np.float32)] * count, [np.ones(ref_size, np.float32)] * count
-    )
-    off = count * 1600 * abs(ppm) / 1e6
-    corrected = pairing.dropped if ppm > 0 else pairing.inserted
-    assert corrected > 0 and pairing.filled == 0 and (pairing.inserted if ppm > 0 else pairing.dropped) == 0
-    assert (
-        off - corrected <= TOLERANCE + 2 * WINDOW * abs(ppm) / 1e6
-    )  # what gathers until a difference has lasted for a window
-    assert got_mic.size >= count * 1600 - MAX_WAIT and sum(b.lost for b in blocks) == corrected
+@pytest.mark.parametrize("first", ["microphone", "reference"])
+def test_an_hour_that_both_have_lost_takes_neither_sound_nor_memory_whichever_tells_first(first):
+    pairing, x, hour = Pairing(), ramp(9600), 3600 * 16_000
+    parts = np.split(x, 6)
+    before = paired(pairing, parts[:2], parts[:2])
+    for by in (hour, -hour) if first == "microphone" else (-hour, hour):
+        pairing.move(by)
+    after = paired(pairing, parts[2:], parts[2:])
+    np.testing.assert_array_equal(np.concatenate((before[1], after[1])), x)
+    assert pairing.filled == pairing.inserted == 0
+
+
+@pytest.mark.parametrize("queued", [1000, 5000])
+def test_what_seemed_lost_at_the_microphone_is_paired_as_if_nothing_had_been_when_it_comes(queued):
+    pairing, x = Pairing(late_is_lost=False), ramp(queued)
+    pairing.play(x)
+    pairing.hear(x[:600])
+    np.testing.assert_array_equal(pairing.pair(600)[1], x[:600])
+    np.testing.assert_array_equal(pairing.skip(200), x[600:800])
+    assert pairing.skipped == 200
+    pairing.put_back(300)  # no more than was skipped
+    pairing.hear(x[600:1000])
+    np.testing.assert_array_equal(*pairing.pair(400))
+    assert pairing.skipped == 0 and pairing.queued == queued - 1000
 
 
 def test_outlet_counts_an_underrun_once_and_waits_for_its_reserve():

@@ -18,9 +18,10 @@ class PortAudioError(Exception):
 class VirtualDevice:
     """One device. takes: (rate, channels) that it can be opened with, None for any. plugged: whether it is there.
 
-    ppm: by how much its clock is fast. swallows: seconds of sound that its driver loses without a word. needs_s: buffer
-    below which each callback is marked as late. level: every sample of an input. channels: how many it has; of more than
-    two the k-th, from 0, sounds as loud as k + 1 tenths. hears: the output whose sound this input gets, a callback later.
+    ppm: by how much its clock is fast. swallows: seconds of sound that its driver loses without a word. holds: seconds of
+    sound that come late, all at once. needs_s: buffer below which each callback is marked as late. level: every sample of an
+    input. sound: what an input hears in place of that, from its start on. channels: how many it has; of more than two the
+    k-th, from 0, sounds as loud as k + 1 tenths. hears: the output whose sound this input gets, a callback later.
     """
 
     name: str
@@ -30,8 +31,10 @@ class VirtualDevice:
     plugged: bool = True
     ppm: float = 0.0
     swallows: float = 0.0
+    holds: float = 0.0
     needs_s: float = 0.0
     level: float = 0.25
+    sound: np.ndarray | None = None
     channels: int = 2
     hears: VirtualDevice | None = None
     played: list = field(default_factory=list)
@@ -45,6 +48,7 @@ class Stream:
             raise PortAudioError("Device unavailable", -9985)
         self.system, self.device, self.rate, self.channels, self.callback = system, device, rate, channels, callback
         self.running, self.due, self.count, self.late = False, system.now, 0, latency < device.needs_s
+        self.begun, self.held = system.now, 0
 
     def start(self) -> None:
         self.running = True
@@ -65,22 +69,36 @@ class Stream:
             if self.device.swallows > 0.0:
                 self.device.swallows -= CALLBACK_S
                 continue
-            size = round((self.count + 1) * CALLBACK_S * self.rate * (1 + 1e-6 * self.device.ppm)) - round(
-                self.count * CALLBACK_S * self.rate * (1 + 1e-6 * self.device.ppm)
-            )
-            self.count += 1
-            status = SimpleNamespace(input_overflow=self.late, output_underflow=self.late)
-            if self.device.kind == "input":
-                sound = np.full((size, self.channels), self.device.level, np.float32)
-                if self.device.channels > 2:
-                    sound = np.tile(0.1 * np.arange(1, self.channels + 1, dtype=np.float32), (size, 1))
-                if heard := self.device.hears:
-                    sound = heard.played.pop(0)[:, None] if heard.played else 0 * sound
-                self.callback(sound, size, None, status)
-            else:
-                out = np.zeros((size, self.channels), np.float32)
-                self.callback(out, size, None, status)
-                self.device.played.append(out[:, 0])
+            if self.device.holds > 0.0:
+                self.device.holds -= CALLBACK_S
+                self.held += 1
+                continue
+            while self.held:
+                self.held -= 1
+                self.call(self.due - (self.held + 1) * CALLBACK_S)
+            self.call(self.due)
+
+    def call(self, due: float) -> None:
+        """The callback with the sound that ended then."""
+        size = round((self.count + 1) * CALLBACK_S * self.rate * (1 + 1e-6 * self.device.ppm)) - round(
+            self.count * CALLBACK_S * self.rate * (1 + 1e-6 * self.device.ppm)
+        )
+        self.count += 1
+        status = SimpleNamespace(input_overflow=self.late, output_underflow=self.late)
+        if self.device.kind == "input":
+            sound = np.full((size, self.channels), self.device.level, np.float32)
+            if self.device.channels > 2:
+                sound = np.tile(0.1 * np.arange(1, self.channels + 1, dtype=np.float32), (size, 1))
+            if self.device.sound is not None:
+                upto = round((due - self.begun) * self.rate)
+                sound = np.repeat(self.device.sound[upto - size : upto, None], self.channels, axis=1)
+            if heard := self.device.hears:
+                sound = heard.played.pop(0)[:, None] if heard.played else 0 * sound
+            self.callback(sound, size, None, status)
+        else:
+            out = np.zeros((size, self.channels), np.float32)
+            self.callback(out, size, None, status)
+            self.device.played.append(out[:, 0])
 
 
 class VirtualPortAudio:

@@ -99,6 +99,19 @@ def test_speech_that_is_handed_over_at_once_is_the_reference_at_the_pace_of_the_
     assert not witness.reference[VOICE.size :].any() and witness.reference.size == heard
 
 
+def test_a_caller_may_use_its_buffers_again_while_what_they_held_still_waits(witness):
+    """As audio callbacks do; at 16 kHz the next frame was in the place of all that waited."""
+    duplex, speech, heard, out = Duplex(witness), np.empty(160, np.float32), np.empty(480, np.float32), []
+    for at in range(0, 4800, 160):
+        speech[:] = VOICE[at : at + 160]
+        duplex.play(speech, RATE)
+    for at in range(0, 9600, 480):
+        heard[:] = -VOICE[at : at + 480]
+        out.append(duplex.hear(heard, RATE).copy())
+    np.testing.assert_array_equal(witness.reference[:4800], VOICE[:4800])
+    np.testing.assert_array_equal(np.concatenate(out), -VOICE[:9600])
+
+
 def test_speech_cut_off_in_mid_word_was_not_played_and_the_next_begins_at_once(witness):
     duplex = Duplex(witness)
     duplex.play(VOICE, RATE)
