@@ -25,6 +25,8 @@ from pathlib import Path
 
 from edgefilter.errors import EdgefilterError
 
+# before numpy is loaded: a process works on each core, and threads of its linear algebra would only wait for the others
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 SCENARIOS = tuple(line.split()[0] for line in str(__doc__).splitlines()[2:] if line)
 
 

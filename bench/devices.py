@@ -1,6 +1,6 @@
 r"""Every real device in one table, a row a device: nothing is known beforehand, nothing is calibrated.
 
-    OMP_NUM_THREADS=1 python -m bench devices RECORDINGS ... --speech HUMAN --whisper WHISPER --output PATH
+    python -m bench devices RECORDINGS ... --speech HUMAN --whisper WHISPER --output PATH
 
 Each folder RECORDINGS holds pairs NAME_lpb (what the loudspeaker was sent) and NAME_mic, 16 kHz mono. Where the robot talks alone,
 humans of --speech are laid on: on a device's only recording at a level and after a time drawn from --ser and --before;

@@ -1,6 +1,6 @@
 r"""Every system on every recording: words, SI-SDR, what was lost and what is left, and where it fails.
 
-    OMP_NUM_THREADS=1 python -m bench evaluate FOLDER [FOLDER ...] --speech HUMAN --whisper WHISPER --output PATH
+    python -m bench evaluate FOLDER [FOLDER ...] --speech HUMAN --whisper WHISPER --output PATH
 
 Below each FOLDER: conversations as bench.simulate.conversations makes them, and pairs NAME_lpb and NAME_mic of real
 devices. Humans of --speech are laid on the robot alone of the devices that match --laid-on, on the half of their

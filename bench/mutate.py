@@ -1,6 +1,6 @@
 """Do the tests notice a change in the code? Mutants by cosmic-ray, a sample of them, and the tests beside each module.
 
-    OMP_NUM_THREADS=1 python -m bench mutate --count 200 --output bench/results/mutate      (hours; --jobs 2)
+    python -m bench mutate --count 200 --output bench/results/mutate      (hours; --jobs 2)
 
 A mutant is a module of edgefilter/FOLDER with one operator, number, condition, decorator or the like replaced. Places
 are drawn at random, each as often as any other, then one of cosmic-ray's replacements there; annotations, which do

@@ -1,6 +1,6 @@
 r"""How far the SI-SDR that a passport predicts is from what other humans have on the same device.
 
-    OMP_NUM_THREADS=1 python -m bench passport RECORDINGS --speech HUMAN --output PATH
+    python -m bench passport RECORDINGS --speech HUMAN --output PATH
 
 RECORDINGS as of `python -m bench devices`; only the robots that talk alone. The passport lays the bundled voice on at each
 level; then humans of --speech are laid on at that level after a time drawn from --before, and what they have is compared.

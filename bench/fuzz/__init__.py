@@ -1,7 +1,7 @@
 """Damaged files by the million: loaders refuse them in one line, and what they accept keeps the filter's promises.
 
-    OMP_NUM_THREADS=1 python -m bench fuzz --inputs 1000000 --minutes 60 --output bench/results/fuzz
-    OMP_NUM_THREADS=1 python -m bench fuzz --clients --minutes 10       (bench/fuzz/clients.py)
+    python -m bench fuzz --inputs 1000000 --minutes 60 --output bench/results/fuzz
+    python -m bench fuzz --clients --minutes 10       (bench/fuzz/clients.py)
 
 Each input is a real file damaged at random, a pure function of seed and number: `--start NUMBER --inputs 1` makes one
 again. A find is a file that is not refused by one EdgefilterError of one line, that breaks a promise after it was taken,
