@@ -32,7 +32,7 @@ CLEAR_DB, LEADS = 0.5, 80
 swapped; where a reflection is louder than the direct sound it is the other way round, so a lag of more than LEADS samples is no sign of
 swapped files, and one below -LEADS, as of recorders that are started by hand, is one unless the reverberation clearly comes after."""
 LOST = 1280
-"""Samples that a loopback loses at once at most: one that does in three recordings loses 8 to 76 ms, in steps of 8."""
+"""Samples that a loopback loses in a second at most: one that does in three recordings loses 8 to 76 ms, in steps of 8."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,20 +60,27 @@ class Belief:
         return int(np.sort(self.certain)[self.certain.size // 2]) if self.certain.size else None
 
     @property
-    def steps(self) -> Array:
-        """By how many samples the likely lag has changed, each time that it has, (k,)."""
-        steps = np.diff(self.lags[self.probability > 0.5])
-        return steps[np.abs(steps) > SAME]
+    def steps(self) -> tuple[Array, Array]:
+        """By how many samples the likely lag has changed, each time that it has, and by how many lost buffers may have changed it, (k,) each."""
+        likely = self.probability > 0.5
+        steps, apart = np.diff(self.lags[likely]), np.diff(self.starts[likely])
+        changed = np.abs(steps) > SAME
+        return steps[changed], LOST * np.maximum(apart[changed] / LOOK, 1.0)
+
+    @property
+    def lossy(self) -> float:
+        """The odds that samples are missing in the reference, over those before anything was heard.
+
+        A step is one of lost buffers, or as likely as not any other: then a lag anywhere is as likely.
+        """
+        steps, most = self.steps
+        return float(np.prod(0.5 + 0.5 * REACH / most * ((steps > 0) & (steps <= most))))
 
     @property
     def lost(self) -> int:
-        """Samples that are missing in the reference: by so many the lag has grown, in steps of LOST at most; 0 unless that is certain.
-
-        A step is one of those, or as likely as not any other: then a lag anywhere is as likely.
-        """
-        lost = (self.steps > 0) & (self.steps <= LOST)
-        odds = EARLY_ODDS * np.prod(np.where(lost, 0.5 + 0.5 * REACH / LOST, 0.5))
-        return int(self.steps[lost].sum()) if odds > CERTAIN else 0
+        """Samples that are missing in the reference, by which the lag has grown; 0 unless that is certain."""
+        steps, most = self.steps
+        return int(steps[(steps > 0) & (steps <= most)].sum()) if EARLY_ODDS * self.lossy > CERTAIN else 0
 
     @property
     def missing(self) -> str:

@@ -239,7 +239,9 @@ class ReferenceWatch:
         # where a robot says something again, so does chance: what is more likely wrong than right is not believed if it agrees
         self._looks.append(found if found.clearness > EVEN else replace(found, clearness=0.0))
         belief = believed(self._looks)
-        self._missing, self._grew, late = belief.missing, bool((belief.steps[-1:] > 0).any()), belief.late[-1]
+        self._grew, late = bool((belief.steps[0][-1:] > 0).any()), belief.late[-1]
+        if belief.missing or belief.lossy <= 1.0:  # what was certain is believed as long as any look still speaks for it
+            self._missing = belief.missing
         if late > CERTAIN / (CERTAIN + 1.0):
             self.verdict = "late"
         elif late < 1.0 / (CERTAIN + 1.0):
