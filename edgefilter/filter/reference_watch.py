@@ -240,7 +240,9 @@ class ReferenceWatch:
         self._looks.append(found if found.clearness > EVEN else replace(found, clearness=0.0))
         belief = believed(self._looks)
         self._grew, late = bool((belief.steps[0][-1:] > 0).any()), belief.late[-1]
-        if belief.missing or belief.lossy <= 1.0:  # what was certain is believed as long as any look still speaks for it
+        if (
+            belief.missing or belief.lossy <= 1.0
+        ):  # what was certain is believed as long as any look still speaks for it
             self._missing = belief.missing
         if late > CERTAIN / (CERTAIN + 1.0):
             self.verdict = "late"

@@ -165,7 +165,11 @@ def test_who_gives_callbacks_is_called_at_the_suspicion_and_at_the_beginning_and
         suspected: list[Event] = []
         settings = BargeInSettings(confirm_s=confirm_s)
         ego = EgoFilter(
-            *(DEMO / "profile.npz", "crnn"), barge_in=settings, on_barge_in=begun.append, on_suspicion=suspected.append
+            DEMO / "profile.npz",
+            engine="crnn",
+            barge_in=settings,
+            on_barge_in=begun.append,
+            on_suspicion=suspected.append,
         )
         ego.process(mic, ref)
         events = ego.events()
