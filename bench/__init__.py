@@ -6,7 +6,7 @@ A scenario is a module (or a package) with a docstring for ``--help`` and two fu
         parser.add_argument("recordings", type=Path)  # output, every, limit, seed, jobs, scheduler, cache, whisper
 
     def run(options) -> str:                      # returns the page; raises EdgefilterError for what a user can mend
-        made_with = results.stamp({"RECORDINGS": [options.recordings]}, systems=["crnn"], models={"WHISPER": options.whisper})
+        made_with = provenance.stamp({"RECORDINGS": [options.recordings]}, systems=["crnn"], models={"WHISPER": options.whisper})
         rows = [...]                              # figures, one dict each
         tables = [results.table("headline", "What it says", ["system", ("SI-SDR, dB", 1)], [["crnn", mean(rows, "si_sdr")]])]
         plots = [results.plot("curve", [results.panel("ERLE", "s", "dB", {"crnn": (x, y)})])]

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench import recordings, results, runner, systems
+from bench import provenance, recordings, results, runner, systems
 from bench.evaluate import names, numbers, of, slim
 from bench.metrics import IN_TIME_S, delays_s, difference, later, mean, per_hour
 from bench.recordings import Cells, Clip, Recording
@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> str:
     here = [one for one in able if one.kind != "detector"]
     clips = find_clips(options)
     data = {"RECORDINGS": options.recordings, "HUMAN": [options.speech]}
-    made_with = results.stamp(data, [one.name for one in here], {"WHISPER": options.whisper})
+    made_with = provenance.stamp(data, [one.name for one in here], {"WHISPER": options.whisper})
     setup = runner.Setup(options.cache, options.whisper)
     rows = runner.run(clips, able, setup, options.jobs, options.scheduler)
     tuned_on = {clip.room for clip in clips if any(fnmatch(clip.room, one) for one in options.tuned_on)}

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import rankdata
 
-from bench import metrics, recordings, results, runner, systems
+from bench import metrics, provenance, recordings, results, runner, systems
 from bench.metrics import QUANTITIES, SECOND, difference, mean, middle, pooled
 from bench.recordings import Cells, Clip
 from bench.systems import System
@@ -86,7 +86,7 @@ def run(options: argparse.Namespace) -> str:
     data = {"recordings": options.folders} | ({"HUMAN": [options.speech]} if options.speech else {})
     models = {"WHISPER": options.whisper, "SECOND": options.second_whisper}
     models |= {one.name: one.model for one in here if one.model}
-    made_with = results.stamp(data, [one.name for one in here], models)
+    made_with = provenance.stamp(data, [one.name for one in here], models)
     setup = runner.Setup(options.cache, options.whisper, tuple(options.network), options.second_whisper)
     rows = runner.run(clips, here, setup, options.jobs, options.scheduler)
     tables = [headline(rows), glance(rows, here), *groups(rows, here, options.against)]

@@ -24,7 +24,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bench import peers, results
+from bench import peers, provenance, results
 from bench.metrics import percentiles
 from bench.recordings import progress
 from edgefilter import Profile, engines
@@ -191,7 +191,7 @@ def run(options: argparse.Namespace) -> str:
     names, missing = contenders()
     names = options.contenders.split(",") if options.contenders else names
     load = os.getloadavg()[0]
-    made_with = results.stamp({"DEMO": [DEMO]}, [name for name in names if name not in PEERS])
+    made_with = provenance.stamp({"DEMO": [DEMO]}, [name for name in names if name not in PEERS])
     turns = [(name, paced) for paced in (False, True) for name in names]
     runs: dict[tuple[str, bool], list[dict]] = defaultdict(list)
     for number in progress(range(options.rounds), "round"):

@@ -31,7 +31,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from bench import results
+from bench import provenance, results
 from bench.cache import Cache, key_of
 from bench.metrics import counted
 from bench.recordings import progress
@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> str:
         for place in (results.ROOT / "edgefilter" / folder, results.ROOT / "tests" / folder):
             if not place.is_dir():
                 raise UsageError(f"there is no {place}, expected folders of edgefilter/ that tests/ has as well")
-    made_with = results.stamp()
+    made_with = provenance.stamp()
     drawn = sample(folders, options.count, options.seed)
     outcomes = _survived(options.output, drawn) if options.again else {}
     missing = [mutant for mutant in drawn if outcomes.get(mutant, "survived") == "survived"]

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench import recordings, results
+from bench import provenance, recordings, results
 from bench.evaluate import names, numbers
 from bench.recordings import Recording
 from edgefilter.commands.demo import speaking
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> str:
     data = {"RECORDINGS": [options.recordings], "HUMAN": [options.speech]}
-    made_with = results.stamp(data, [f"{engine}-uncalibrated" for engine in options.engines])
+    made_with = provenance.stamp(data, [f"{engine}-uncalibrated" for engine in options.engines])
     found = list(cases(options))
     if not found:
         lacks = f"no recording of a robot alone of {LEAST_S:.0f} s or more"

@@ -1,7 +1,7 @@
 """The one writer of results: a JSON file, from which the Markdown page, its pictures and an HTML page are generated.
 
 A file has parts, one for each program that wrote to it: {"schema", "parts": {NAME: {"title", "stamp", "notes", "tables",
-"plots", ...}}}. Take `stamp` before measuring, so that it is of what ran and not of what was edited meanwhile.
+"plots", ...}}}. The stamp is that of bench/provenance.py.
 """
 
 from __future__ import annotations
@@ -15,9 +15,7 @@ import os
 import platform
 import re
 import subprocess
-import sys
 from collections.abc import Iterable, Mapping, Sequence
-from datetime import datetime, timezone
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -25,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from edgefilter import engines
-from edgefilter.errors import EdgefilterError, UsageError
+from edgefilter.errors import UsageError
 from edgefilter.filter.budget import processor, versions
 
 SCHEMA = 3
@@ -39,36 +37,7 @@ QUOTED = re.compile(r"(<!-- table: (\w+)/([\w-]+) -->\n).*?(<!-- end -->)", re.D
 CHUNK = 1 << 20
 
 
-# ---------------------------------------------------------------- what a result is made with and from
-
-
-def stamp(
-    data: Mapping[str, Sequence[Path]] | None = None,
-    systems: Iterable[str] = (),
-    models: Mapping[str, Path | None] | None = None,
-) -> dict:
-    """What a result is made with and from, ready for JSON; take it before measuring.
-
-    data: folders (or files) that are read, by what they are: {"HUMAN": [Path("human/val")]}; of a folder its last
-    part is written down, with its `digest`. systems: rows of bench/systems.py that are measured, or "diagnosis";
-    bench.stale compares what they do with today's. models: files or folders by name, None where none is used. Raises
-    UsageError for what is not there.
-    """
-    from bench import stale  # it runs the systems, which know of results
-
-    data, systems = dict(data or {}), list(systems)
-    files = models_of(systems) | {name: path for name, path in (models or {}).items() if path is not None}
-    commit, dirty = revision()
-    return {
-        "command": command(data, files),
-        "commit": commit,
-        "dirty": dirty,
-        "data": [{"what": w, "folder": p.resolve().name, **digest(p)} for w, paths in data.items() for p in paths],
-        "models": {name: digest(path) for name, path in files.items()},
-        "judged": stale.digests_of(systems),
-        "machine": machine(),
-        "date": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
-    }
+# ---------------------------------------------------------------- what code, data and machine are
 
 
 def digest(path: Path) -> dict:
@@ -83,24 +52,6 @@ def digest(path: Path) -> dict:
         whole.update(f"{file.relative_to(path).as_posix()}\0{file.stat().st_size}\0".encode() + _sha256(file).digest())
         size += file.stat().st_size
     return {"files": len(files), "bytes": size, "sha256": whole.hexdigest()}
-
-
-def models_of(systems: Iterable[str]) -> dict[str, Path]:
-    """The model files that the engines behind these rows load, by file name; one whose model is missing has none."""
-    found = {}
-    for system in systems:
-        for name in engines.HAVE_MODEL:
-            if (
-                system == "auto"
-                or system == name
-                or system.startswith(tuple(f"{name}-{way}" for way in ("learning", "uncalibrated", "listen")))
-            ):
-                try:
-                    path = engines.create(name).model.path
-                except EdgefilterError:
-                    continue
-                found[path.name] = path
-    return found
 
 
 def code_digest(files: Iterable[Path] | None = None) -> str:
@@ -127,21 +78,6 @@ def machine() -> dict[str, str]:
     """Processor, threads, system, Python and package versions."""
     threads = os.environ.get("OMP_NUM_THREADS") or f"not limited, {os.cpu_count()} cores"
     return {"processor": processor(), "threads": threads, "system": platform.system(), **versions(PACKAGES)}
-
-
-def command(data: Mapping[str, Sequence[Path]], models: Mapping[str, Path]) -> str:
-    """The command line that runs now: data and models by what they are, other paths by their last part."""
-    known = {path.resolve(): f"{what}/{path.resolve().name}" for what, paths in data.items() for path in paths}
-    known |= {path.resolve(): name for name, path in models.items()}
-
-    def without_folders(argument: str) -> str:
-        if argument.startswith("-"):
-            option, equals, value = argument.partition("=")
-            return option + equals + without_folders(value) if value else argument
-        path = Path(argument)
-        return known.get(path.resolve()) or (path.name if path.is_absolute() or ".." in path.parts else argument)
-
-    return " ".join(["python -m bench", *map(without_folders, sys.argv[1:])])
 
 
 def _sha256(path: Path) -> hashlib._Hash:
@@ -197,7 +133,7 @@ def write(
     """Write the part NAME of OUTPUT.json, then OUTPUT.md and its pictures from the whole file; return the part's page.
 
     output: without suffix; None: nothing is written. Parts of other names that the file holds already stay. made_with:
-    from `stamp`. tables, plots: from `table` and `plot`, all that the page shows besides the notes, in Markdown. data:
+    from `provenance.stamp`. tables, plots: from `table` and `plot`, all that the page shows besides the notes, in Markdown. data:
     whatever else the JSON file is to hold; numbers that are not finite become null.
     """
     part = plain({"title": title, "stamp": made_with, "notes": notes, "tables": tables, "plots": plots, **data})

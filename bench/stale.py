@@ -8,85 +8,14 @@ with the sentences that quote it.
 from __future__ import annotations
 
 import argparse
-import hashlib
-from collections.abc import Iterable
-from contextlib import suppress
-from dataclasses import dataclass
-from functools import cache, cached_property
 from pathlib import Path
 
-import numpy as np
-
 import edgefilter
-from bench import results
+from bench import provenance, results
 from bench.cache import Cache
-from bench.recordings import Clip, Signals, read
-from edgefilter.errors import EdgefilterError, UsageError
+from bench.provenance import DIAGNOSIS, LEARNING, digest_of
+from edgefilter.errors import UsageError
 from edgefilter.filter.budget import DEMO
-from edgefilter.profile.data import Profile
-
-DIAGNOSIS = "diagnosis"
-"""Stands among the systems for the names and values that the diagnosis finds."""
-LEARNING = "-learning"
-"""Ends the names of systems that learn, which takes half of all the time here: they are judged by one demonstration."""
-
-
-@dataclass(frozen=True)
-class Demo:
-    """A bundled demonstration, as a Clip has its source."""
-
-    folder: Path
-
-    @property
-    def name(self) -> str:
-        return self.folder.name
-
-    @cached_property
-    def profile(self) -> Profile:
-        return Profile.load(self.folder / "profile.npz")
-
-    def signals(self) -> Signals:
-        mic, ref = (read(self.folder / f"{name}.flac") for name in ("mic", "reference"))
-        human = self.folder / "human.flac"
-        return Signals(mic, ref, read(human) if human.exists() else None)
-
-
-@cache
-def demos() -> tuple[Clip, ...]:
-    """A human who interrupts a robot, and a robot alone with a hidden effect."""
-    return tuple(Clip("demo", "demo", Demo(folder)) for folder in (DEMO, DEMO / "hidden" / "one"))
-
-
-@cache
-def digest_of(name: str) -> str | None:
-    """Of what a system makes of the demonstrations, as 16-bit samples; None where it cannot run on them."""
-    if name == DIAGNOSIS:
-        return _of_diagnosis()
-    from bench import systems  # slow to load
-
-    found = systems.catalogue().get(name)
-    if found is None:
-        return None
-    sounds = []
-    for clip in demos()[:1] if name.endswith(LEARNING) else demos():
-        with suppress(EdgefilterError):  # a row that needs what a demonstration does not have
-            found.missing()
-            sounds.append(np.rint(32767 * np.clip(found.run(clip).samples, -1, 1)).astype("<i2").tobytes())
-    return hashlib.sha256(b"".join(sounds)).hexdigest()[:16] if sounds else None
-
-
-def _of_diagnosis() -> str:
-    clip = demos()[1]
-    found = edgefilter.diagnose(clip.source.profile, clip.mic, clip.ref)
-    said = []
-    for one in found.ranking:
-        values = {key: [f"{x:.2g}" for x in np.atleast_1d(value.value)] for key, value in one.parameters.items()}
-        said.append((one.effect, sorted(values.items())))
-    return hashlib.sha256(repr((found.verdict, said)).encode()).hexdigest()[:16]
-
-
-def digests_of(systems: Iterable[str]) -> dict[str, str]:
-    return {name: digest for name in systems if (digest := digest_of(name)) is not None}
 
 
 def today(name: str, kept: Cache) -> str | None:
@@ -94,7 +23,7 @@ def today(name: str, kept: Cache) -> str | None:
     if not name.endswith(LEARNING) and name != DIAGNOSIS:
         return digest_of(name)
     code = [path for package in (Path(edgefilter.__file__), Path(__file__)) for path in package.parent.rglob("*.py")]
-    models = {model: results.digest(path) for model, path in results.models_of([name]).items()}
+    models = {model: results.digest(path) for model, path in provenance.models_of([name]).items()}
     made_of = results.code_digest(sorted(code)), models, results.digest(DEMO), results.machine()
     return kept.get(lambda: digest_of(name), name, *made_of)
 

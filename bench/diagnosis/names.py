@@ -20,10 +20,10 @@ from pathlib import Path
 
 import numpy as np
 
-from bench import results
+from bench import provenance, results
 from bench.metrics import counted
+from bench.provenance import DIAGNOSIS
 from bench.recordings import CALIBRATION, progress, read
-from bench.stale import DIAGNOSIS
 from edgefilter.calibration.calibrate import calibrate
 from edgefilter.diagnosis.diagnose import diagnose
 from edgefilter.echo.effects.catalogue import find
@@ -183,7 +183,7 @@ def counts(found: Sequence[Outcome]) -> dict[str, dict]:
 
 def run(options: argparse.Namespace) -> str:
     """All folders, each with its columns in one table, then its effects and its misses."""
-    made_with = results.stamp({"CASES": options.cases}, [DIAGNOSIS])
+    made_with = provenance.stamp({"CASES": options.cases}, [DIAGNOSIS])
     found = {folder.resolve().name: outcomes(folder, options.limit, options.jobs) for folder in options.cases}
     cases = {name: [asdict(one) for one in of] for name, of in found.items()}
     title = "Hidden effects: what the diagnosis says"

@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import kstest, norm
 
-from bench import results
+from bench import provenance, results
 from bench.diagnosis.names import find_cases, signals
 from bench.metrics import counted
+from bench.provenance import DIAGNOSIS
 from bench.recordings import CALIBRATION, progress
-from bench.stale import DIAGNOSIS
 from edgefilter.calibration.calibrate import calibrate
 from edgefilter.diagnosis.ordinary import LEAST_DB, Chance, Ordinary, explained_db, p_value
 from edgefilter.diagnosis.prepare import prepare
@@ -90,7 +90,7 @@ def _middle_and_spread(explained: Array) -> tuple[float, float]:
 
 
 def run(options: argparse.Namespace) -> str:
-    made_with = results.stamp({"CASES": options.cases}, [DIAGNOSIS])
+    made_with = provenance.stamp({"CASES": options.cases}, [DIAGNOSIS])
     cases = [case for folder in options.cases for case in find_cases(folder, options.limit)]
     if options.learn and len(cases) < ENOUGH:
         raise UsageError(f"found {len(cases)} recordings to learn from, expected {ENOUGH} or more")

@@ -15,12 +15,12 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from bench import results
+from bench import provenance, results
 from bench.metrics import counted
+from bench.provenance import DIAGNOSIS
 from bench.recordings import progress
 from bench.simulate.asked_robot import AskedRobot, make
 from bench.simulate.conversations import read_voices
-from bench.stale import DIAGNOSIS
 from edgefilter.calibration.calibrate import calibrate
 from edgefilter.calibration.sweep import generate_sweep
 from edgefilter.diagnosis.probe import ENOUGH, SOUND_S, Inquiry, weights
@@ -119,7 +119,7 @@ def tables(rows: Sequence[Row]) -> list[dict]:
 
 
 def run(options: argparse.Namespace) -> str:
-    made_with = results.stamp({"ROBOT": [options.voices]}, [DIAGNOSIS])
+    made_with = provenance.stamp({"ROBOT": [options.voices]}, [DIAGNOSIS])
     voices, rows = read_voices([options.voices]), []
     asked = [(number, pair, truth) for number in range(options.count) for pair in PAIRS for truth in pair]
     for number, pair, truth in progress(asked, "robot"):

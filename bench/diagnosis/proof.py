@@ -17,11 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from bench import results
+from bench import provenance, results
 from bench.diagnosis.names import find_cases, signals
 from bench.metrics import counted
+from bench.provenance import DIAGNOSIS
 from bench.recordings import CALIBRATION, find_recordings
-from bench.stale import DIAGNOSIS
 from edgefilter.calibration.calibrate import calibrate
 from edgefilter.calibration.from_recording import self_calibrate
 from edgefilter.diagnosis.diagnose import diagnose
@@ -116,7 +116,7 @@ def of_real(folder: Path, limit: int | None) -> Iterator[Row]:
 
 
 def run(options: argparse.Namespace) -> str:
-    made_with = results.stamp({"CASES": options.cases, "REAL": options.real}, [DIAGNOSIS, "linear-uncalibrated"])
+    made_with = provenance.stamp({"CASES": options.cases, "REAL": options.real}, [DIAGNOSIS, "linear-uncalibrated"])
     found = {folder.resolve().name: list(of_cases(folder, options.limit)) for folder in options.cases}
     found |= {folder.resolve().name: list(of_real(folder, options.limit)) for folder in options.real}
     rows = {name: [asdict(row) for row in of] for name, of in found.items()}

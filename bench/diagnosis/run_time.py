@@ -12,13 +12,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from bench import results
+from bench import provenance, results
 from bench.metrics import mean
+from bench.provenance import DIAGNOSIS
 from bench.recordings import progress
 from bench.simulate.conversations import read_clips, read_voices
 from bench.simulate.hidden_cases import EffectConversation, make_conversation
 from bench.simulate.simulated_robot import RATE
-from bench.stale import DIAGNOSIS
 from edgefilter import Profile, calibrate, enhance
 from edgefilter.diagnosis.diagnose import add
 from edgefilter.dsp.metrics import erle, si_sdr
@@ -91,7 +91,7 @@ def run(options: argparse.Namespace) -> str:
     for name in effects:
         find(name)
     data = {"ROBOT": [options.voices], "HUMAN": [options.speech]}
-    made_with = results.stamp(data, [DIAGNOSIS, *engines])
+    made_with = provenance.stamp(data, [DIAGNOSIS, *engines])
     voices, people = read_voices([options.voices]), read_clips(options.speech, (3.0, 6.0))
     turns = [(effect, turn) for turn in range(options.count) for effect in effects]
     rows = []

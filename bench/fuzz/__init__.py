@@ -27,7 +27,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from bench import results
+from bench import provenance, results
 from bench.fuzz.targets import NETWORKS, TARGETS, Target
 from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.filter.budget import DEMO
@@ -92,7 +92,7 @@ def run(options: argparse.Namespace) -> str:
 
         options.minutes = 10.0 if options.minutes is None else options.minutes
         return clients.run(options)
-    made_with = results.stamp({"DEMO": [DEMO], "NETWORKS": [NETWORKS]})
+    made_with = provenance.stamp({"DEMO": [DEMO], "NETWORKS": [NETWORKS]})
     context = multiprocessing.get_context("spawn")
     number, counts = context.Value("q", options.start), context.Array("q", len(TARGETS) * len(COLUMNS))
     began, at, end, deaths = time.time(), options.start, options.start + options.inputs, []

@@ -29,7 +29,7 @@ import numpy as np
 from wyoming.audio import AudioChunk
 from wyoming.client import AsyncClient
 
-from bench import results
+from bench import provenance, results
 from bench.fuzz.targets import damaged, damaged_json, sound
 from bench.metrics import percentiles
 from bench.serve import clients as streams
@@ -245,7 +245,7 @@ async def beside(
 
 def run(options: argparse.Namespace) -> str:
     """Attack both services for so many minutes; the page with the figures. Raises UsageError where there are finds."""
-    made_with = results.stamp({"DEMO": [DEMO]})
+    made_with = provenance.stamp({"DEMO": [DEMO]})
     context = multiprocessing.get_context("spawn")
     serve, quiet, microphone, loudspeaker = free_ports(4)
     ports = {"serve": serve, "microphone": microphone, "loudspeaker": loudspeaker}

@@ -26,7 +26,7 @@ from pathlib import Path
 import jiwer
 import numpy as np
 
-from bench import results
+from bench import provenance, results
 from bench.cache import Cache
 from bench.metrics import (
     IN_TIME_S,
@@ -264,7 +264,7 @@ def run(options: argparse.Namespace) -> str:
     engine = options.engine or "crnn"
     data = {"HUMAN": [options.speech], "ROBOT": options.voices, "ALONE": options.alone}
     data |= {"RECORDINGS": [options.real]} if options.real else {}
-    made_with = results.stamp(data, [engine], {"WHISPER": options.whisper})
+    made_with = provenance.stamp(data, [engine], {"WHISPER": options.whisper})
     recogniser = Recogniser(options.whisper, Cache(options.cache)) if options.whisper else None
     kept = Cache(options.cache, "barge_in")
     sources = [entry["sha256"] for entry in made_with["data"]]

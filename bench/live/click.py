@@ -17,7 +17,7 @@ import numpy as np
 import soundfile
 from scipy import signal
 
-from bench import results
+from bench import provenance, results
 from bench.live import virtual_sound
 from edgefilter.filter.budget import DEMO
 from edgefilter.types import SAMPLE_RATE
@@ -31,7 +31,7 @@ CLICK = 160
 
 def run(options: argparse.Namespace) -> str:
     names = [options.engine] if options.engine else list(ENGINES)
-    made_with = results.stamp({"DEMO": [DEMO]}, names)
+    made_with = provenance.stamp({"DEMO": [DEMO]}, names)
     starts = {name: [start(name) for _ in range(options.count)] for name in names}
     clicks = {name: round_trip(name, options.count) for name in (ALONE, *names)}
     devices = float(np.nanmedian(clicks[ALONE]))

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 import soundfile
 
-from bench import results
+from bench import provenance, results
 from bench.live import virtual_sound
 from bench.live.virtual_sound import children_mb, memory_mb
 from bench.metrics import percentiles
@@ -55,7 +55,7 @@ changes its speed by more than that, and the bypass with it."""
 def run(options: argparse.Namespace) -> str:
     engine = options.engine or "auto"
     # "auto" is crnn wherever that is fast enough
-    made_with = results.stamp({"DEMO": [DEMO]}, [options.engine or "crnn"])
+    made_with = provenance.stamp({"DEMO": [DEMO]}, [options.engine or "crnn"])
     is_live, one_way = options.part == "hour", options.one_way
     found = live(options.minutes, engine) if is_live else from_file(options.minutes, engine, one_way)
     found["load_average"] = os.getloadavg()[0]

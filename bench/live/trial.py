@@ -26,7 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench import results
+from bench import provenance, results
 from bench.cache import Cache
 from bench.live import virtual_sound
 from bench.live.soak import late
@@ -214,7 +214,7 @@ def sentences(
 def run(options: argparse.Namespace) -> str:
     engine = options.engine or "auto"
     data = {"ROBOT": options.voices, "HUMAN": [options.speech]}
-    made_with = results.stamp(data, [engine], {"WHISPER": options.whisper})
+    made_with = provenance.stamp(data, [engine], {"WHISPER": options.whisper})
     clips = [clip for folder in options.voices for clip in read_clips(folder, CLIP_S)]
     day = make_day(options.seed, options.minutes, clips, read_clips(options.speech, CLIP_S))
     recogniser = Recogniser(options.whisper, Cache(options.cache)) if options.whisper else None

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit, logit
 
-from bench import metrics, recordings, results, systems
+from bench import metrics, provenance, recordings, results, systems
 from bench.metrics import FRAME, IN_TIME_S, THRESHOLDS
 from bench.recordings import Cells, Signals, progress
 from edgefilter.filter.barge_in import CENTRE, SLOPE, BargeInSettings
@@ -188,7 +188,7 @@ def tables(kinds: dict[str, dict]) -> list[dict]:
 def run(options: argparse.Namespace) -> str:
     data = {"RECORDINGS": [options.real] if options.real else [], "conversations": options.conversations}
     data["HUMAN"] = [options.speech] if options.speech else []
-    made_with = results.stamp(data, ["crnn", "crnn-uncalibrated"])
+    made_with = provenance.stamp(data, ["crnn", "crnn-uncalibrated"])
     found, kinds = list(streams(options)), {}
     for kind in dict.fromkeys(one.kind for one in found):
         own = [one for one in found if one.kind == kind]

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from bench import recordings, results, runner
+from bench import provenance, recordings, results, runner
 from bench.cache import Cache
 from bench.metrics import SECOND, CachedMetrics, difference, mean, middle, pooled
 from bench.recordings import Cells, Clip, progress
@@ -128,7 +128,7 @@ def contenders(
     code = results.code_digest()
     found = {"linear": Contender(partial(create, "linear"), code)}
     for name in (BASE, "crnn"):
-        shipped = "".join(results.digest(path)["sha256"] for path in results.models_of([name]).values())
+        shipped = "".join(results.digest(path)["sha256"] for path in provenance.models_of([name]).values())
         found |= _with_error(name, Contender(partial(create, name), code + shipped), error)
     folder.mkdir(parents=True, exist_ok=True)
     for path in checkpoints:
@@ -225,7 +225,7 @@ def run(options: argparse.Namespace) -> str:
     data = {"conversations": options.conversations}
     data |= {"RECORDINGS": [options.real], "HUMAN": [options.speech]} if options.real else {}
     models = {"WHISPER": options.whisper, "SECOND": options.second_whisper, **checkpoints}
-    made_with = results.stamp(data, ["linear", BASE, "crnn"], models)
+    made_with = provenance.stamp(data, ["linear", BASE, "crnn"], models)
     making = contenders(options.checkpoints, options.wiener, options.error, options.cache / "checkpoints")
     setup = runner.Setup(options.cache, options.whisper, second_whisper=options.second_whisper)
     cached, kept = runner.cached_metrics(setup), Cache(options.cache, "rows")

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from bench import __main__ as bench
-from bench import mutate, results
+from bench import mutate, provenance, results
 from edgefilter.errors import UsageError
 
 CODE = '''"""A module."""
@@ -43,7 +43,7 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (root / "tests/alignment/test_twice.py").write_text(TEST)
     (root / "tests/pytest.ini").write_text("[pytest]\nmarkers = slow\n")
     monkeypatch.setattr(results, "ROOT", root)
-    monkeypatch.setattr(results, "stamp", lambda *of: {"command": "c", "commit": "0", "dirty": False, "data": [],
+    monkeypatch.setattr(provenance, "stamp", lambda *of: {"command": "c", "commit": "0", "dirty": False, "data": [],
                                                        "models": {}, "judged": {}, "machine": {}, "date": ""})  # fmt: skip
     return root
 

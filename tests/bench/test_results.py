@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench import results
+from bench import provenance, results
 from edgefilter.engines import create
 from edgefilter.errors import UsageError
 from tests.bench.conftest import rows_of
@@ -44,9 +44,9 @@ def test_digest_is_of_names_and_contents_and_not_of_the_place(data: Path, tmp_pa
 
 def test_an_empty_folder_or_a_missing_model_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="holds no file"):
-        results.stamp({"HUMAN": [tmp_path]})
+        provenance.stamp({"HUMAN": [tmp_path]})
     with pytest.raises(UsageError, match="model.bin holds no file"):
-        results.stamp(models={"WHISPER": tmp_path / "model.bin"})
+        provenance.stamp(models={"WHISPER": tmp_path / "model.bin"})
 
 
 def test_stamp_and_pages_hold_no_folder_of_this_machine(
@@ -68,7 +68,7 @@ def test_stamp_and_pages_hold_no_folder_of_this_machine(
         "3",
     ]
     monkeypatch.setattr("sys.argv", [str(tmp_path / "bench"), "evaluate", *arguments])
-    made_with = results.stamp({"HUMAN": [data]}, models={"WHISPER": whisper, "best.pt": network, "other": None})
+    made_with = provenance.stamp({"HUMAN": [data]}, models={"WHISPER": whisper, "best.pt": network, "other": None})
     wanted = "python -m bench evaluate --speech HUMAN/val --whisper WHISPER --cache=kept --output quality.v1 --seed 3"
     assert made_with["command"] == wanted
     assert set(made_with["models"]) == {"WHISPER", "best.pt"}
@@ -88,12 +88,14 @@ def test_an_engine_with_a_network_brings_the_hash_of_its_file() -> None:
     path = create("crnn").model.path
     wanted = {path.name: hashlib.sha256(path.read_bytes()).hexdigest()}
     for name in ("crnn", "crnn-uncalibrated", "crnn-uncalibrated-learning", "auto"):
-        assert {key: results.digest(file)["sha256"] for key, file in results.models_of(["ss", name]).items()} == wanted
-    assert results.models_of(["ss", "aec3"]) == {}
+        assert {
+            key: results.digest(file)["sha256"] for key, file in provenance.models_of(["ss", name]).items()
+        } == wanted
+    assert provenance.models_of(["ss", "aec3"]) == {}
 
 
 def test_a_part_that_is_made_again_leaves_the_others_alone(tmp_path: Path) -> None:
-    made_with = results.stamp()
+    made_with = provenance.stamp()
     output = tmp_path / "live"
     plots = [
         results.plot("curve", [results.panel("p", "s", "dB", {"a": ([0, 1], [1.0, None]), "b": ([0, 1], [2.0, 3.0])})])
@@ -110,7 +112,7 @@ def test_a_part_that_is_made_again_leaves_the_others_alone(tmp_path: Path) -> No
 def test_a_quoted_table_is_made_from_the_results(tmp_path: Path) -> None:
     rows = [["a", {"mean": 31.4, "low": 25.0, "high": 37.0}]]
     results.write(
-        tmp_path / "devices", "devices", "D", results.stamp(), [results.table("six", "Six", ["row", ("%", 0)], rows)]
+        tmp_path / "devices", "devices", "D", provenance.stamp(), [results.table("six", "Six", ["row", ("%", 0)], rows)]
     )
     page = "before\n<!-- table: devices/six -->\nold\n<!-- end -->\nafter"
     made = results.quote(page, tmp_path)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from bench import __main__ as program
-from bench import results, stale, systems
+from bench import provenance, results, stale, systems
 from bench.cache import Cache
 from bench.systems import Output
 
@@ -25,22 +25,22 @@ def test_a_result_is_stale_where_a_system_gives_another_sound(
     known = systems.catalogue()
     row = replace(known["unfiltered"], name="half", run=lambda clip: Output(np.float32(gain[0]) * clip.mic))
     monkeypatch.setattr(systems, "catalogue", lambda *_: {"half": row, "unfiltered": known["unfiltered"]})
-    stale.digest_of.cache_clear()
-    results.write(tmp_path / "devices", "devices", "D", results.stamp(systems=["half", "unfiltered", "nobody"]))
+    provenance.digest_of.cache_clear()
+    results.write(tmp_path / "devices", "devices", "D", provenance.stamp(systems=["half", "unfiltered", "nobody"]))
     assert set(results.read(tmp_path / "devices.json")["parts"]["devices"]["stamp"]["judged"]) == {"half", "unfiltered"}
     file = str(tmp_path / "devices.json")
     assert program.main(["stale", file]) == 0
     gain[0] = 1.0 + 1e-9  # rounding that no 16-bit sample shows
-    stale.digest_of.cache_clear()
+    provenance.digest_of.cache_clear()
     assert program.main(["stale", file]) == 0
     gain[0] = 0.5
-    stale.digest_of.cache_clear()
+    provenance.digest_of.cache_clear()
     assert program.main(["stale", file]) == 1
     assert "devices.json, devices: half behave differently now" in capsys.readouterr().err
     old = tmp_path / "old.json"
     old.write_text(json.dumps({"schema": 2, "rows": []}))
     assert stale.stale(old, Cache(None)) == ["old.json: of an earlier form"]
-    stale.digest_of.cache_clear()
+    provenance.digest_of.cache_clear()
 
 
 def test_what_is_learned_is_computed_once_for_the_same_code_and_anew_for_another(
@@ -56,17 +56,17 @@ def test_what_is_learned_is_computed_once_for_the_same_code_and_anew_for_another
     found = []
     for code in ("one", "one", "two"):
         monkeypatch.setattr(results, "code_digest", lambda files=None, code=code: code)
-        stale.digest_of.cache_clear()
+        provenance.digest_of.cache_clear()
         found.append(stale.today(row.name, Cache(tmp_path, "digests")))
     assert len(set(found)) == 1 and len(heard) == 2  # one demonstration each time
-    stale.digest_of.cache_clear()
+    provenance.digest_of.cache_clear()
 
 
 @pytest.mark.slow
 def test_the_demonstrations_can_be_heard_by_every_engine() -> None:
-    assert [clip.human is not None for clip in stale.demos()] == [True, False]
-    linear, again = stale.digest_of("linear"), stale.digests_of(["linear", "dtln-aec"])
-    assert linear and again == {"linear": linear} and stale.digest_of("linear-uncalibrated") != linear
+    assert [clip.human is not None for clip in provenance.demos()] == [True, False]
+    linear, again = provenance.digest_of("linear"), provenance.behaviour(["linear", "dtln-aec"])
+    assert linear and again == {"linear": linear} and provenance.digest_of("linear-uncalibrated") != linear
 
 
 def test_a_scenario_computes_in_one_thread_unless_more_are_asked_for() -> None:
