@@ -8,9 +8,12 @@ from typing import get_args
 import numpy as np
 import pytest
 import soundfile
+import soxr
 
 import edgefilter
-from edgefilter import EgoFilter, types
+from edgefilter import EgoFilter, calibrate, enhance, generate_sweep, types
+from edgefilter.dsp.metrics import si_sdr
+from edgefilter.errors import UsageError
 
 DEMO = Path(edgefilter.__file__).parent / "demo_data"
 
@@ -57,3 +60,17 @@ def test_events_are_of_the_kinds_of_their_type():
     ego.process(mic, ref)
     kinds = {event.kind for event in ego.events()}
     assert {"realigned", "speech_started"} <= kinds <= set(get_args(types.EventKind))
+
+
+def test_recordings_of_any_rate_are_taken_and_given_back_as_long():
+    mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0][:80_000] for name in ("mic", "reference"))
+    fast = [soxr.resample(sound, 16_000, 48_000) for sound in (mic, ref)]
+    found = enhance(*fast, engine="linear", sample_rate=48_000)
+    slow = enhance(*(soxr.resample(sound, 48_000, 16_000) for sound in fast), engine="linear")
+    assert found.shape == fast[0].shape and si_sdr(soxr.resample(found, 48_000, 16_000), slow) > 30
+    played = generate_sweep()
+    heard, quiet = 0.5 * np.roll(played, 300), np.full(64_000, 1e-6, np.float32) * (-1) ** np.arange(64_000)
+    three = [soxr.resample(sound.astype(np.float32), 16_000, 48_000) for sound in (played, heard, quiet)]
+    assert abs(calibrate(*three, sample_rate=48_000).delay - 300) <= 1
+    with pytest.raises(UsageError, match="sample_rate is 441, expected 8000 to 192000 Hz"):
+        enhance(mic, ref, sample_rate=441)

@@ -11,6 +11,7 @@ from edgefilter.calibration.sweep import MIN_TAPS, Deconvolution, deconvolve, di
 from edgefilter.dsp.exchange import EQUAL
 from edgefilter.dsp.frames import all_block_power, frames
 from edgefilter.dsp.psd import GRID_FFT, hann, third_octave_bands
+from edgefilter.dsp.resample import at_16_khz
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import CalibrationError, SignalError
 from edgefilter.profile.array import ArrayCalibration
@@ -27,15 +28,21 @@ FARTHEST = 32
 
 
 def calibrate(
-    sweep_reference: Samples, sweep_recording: Samples, noise_recording: Samples, *, created: str = "", source: str = ""
+    sweep_reference: Samples,
+    sweep_recording: Samples,
+    noise_recording: Samples,
+    *,
+    created: str = "",
+    source: str = "",
+    sample_rate: int = SAMPLE_RATE,
 ) -> Profile:
     """Measure the robot's own voice at its microphone.
 
     Parameters
     ----------
     sweep_reference : ndarray of float, shape (n,)
-        An exponential sweep as it was played, with silence around it (`generate_sweep`). All three at 16 kHz, full
-        scale +-1.
+        An exponential sweep as it was played, with silence around it (`generate_sweep`). Full scale +-1, as of
+        all three.
     sweep_recording : ndarray of float, shape (m,) or (m, channels)
         What the microphone heard, on the same sample counter to within -2000 samples and 1.6 s; or two to eight
         microphones that share a clock.
@@ -43,6 +50,8 @@ def calibrate(
         The fan alone, some seconds, in the same microphones.
     created, source : str
         Texts for the profile: when, and from what.
+    sample_rate : int
+        Of the three recordings; they are converted to 16 kHz.
 
     Returns
     -------
@@ -70,7 +79,8 @@ def calibrate(
     >>> profile.delay, round(float(profile.response[100]), 2)
     (300.0, 0.5)
     """
-    reference, recordings, noises = checked(sweep_reference, sweep_recording, noise_recording)
+    given = (at_16_khz(x, sample_rate) for x in (sweep_reference, sweep_recording, noise_recording))
+    reference, recordings, noises = checked(*given)
     recording, noise = first(recordings), first(noises)
     law = sweep_law(reference)
     check_lengths(law, recording, noise)

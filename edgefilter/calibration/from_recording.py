@@ -13,6 +13,7 @@ from edgefilter.dsp.fractional_delay import delayed, interpolate
 from edgefilter.dsp.frames import SILENT, all_block_power, block_power, decibels, frames
 from edgefilter.dsp.lag import correlation_near, flat_cross
 from edgefilter.dsp.psd import ROUNDING_PSD, periodograms, third_octave_bands
+from edgefilter.dsp.resample import at_16_khz
 from edgefilter.echo.effects.catalogue import EFFECTS
 from edgefilter.echo.measurement import whiten
 from edgefilter.echo.model import EchoModel
@@ -40,15 +41,17 @@ MOMENT = SAMPLE_RATE // 20
 """Samples over which the disturbance is measured that the fit gives way to."""
 
 
-def self_calibrate(recording: Samples, reference: Samples) -> Profile:
+def self_calibrate(recording: Samples, reference: Samples, *, sample_rate: int = SAMPLE_RATE) -> Profile:
     """Make a provisional profile from a recording of the robot alone, where there is no calibration.
 
     Parameters
     ----------
     recording : ndarray of float, shape (n,)
-        The robot at its microphone, 16 kHz, full scale +-1.
+        The robot at its microphone, full scale +-1.
     reference : ndarray of float, shape (m,)
         What it said, as sent to the loudspeaker.
+    sample_rate : int
+        Of both; they are converted to 16 kHz.
 
     Returns
     -------
@@ -75,7 +78,7 @@ def self_calibrate(recording: Samples, reference: Samples) -> Profile:
     >>> self_calibrate(heard, said).delay
     300.0
     """
-    y, x = paired(recording, reference)
+    y, x = paired(at_16_khz(recording, sample_rate), at_16_khz(reference, sample_rate))
     believed = believe(y, x)
     lag = find_lag(y, x, believed)
     ppm, behind = find_drift(y, delayed(x, lag))

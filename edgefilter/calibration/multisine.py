@@ -26,6 +26,7 @@ from edgefilter.dsp.fractional_delay import interpolate
 from edgefilter.dsp.frames import decibels
 from edgefilter.dsp.lag import correlation_near, highest, top
 from edgefilter.dsp.psd import ROUNDING_PSD, total_power
+from edgefilter.dsp.resample import at_16_khz
 from edgefilter.errors import CalibrationError
 from edgefilter.profile.approximation import CLEARLY_DB, LinearApproximation
 from edgefilter.profile.data import GRID_HZ, Profile
@@ -147,15 +148,21 @@ def multisine_law(reference: Samples) -> MultisineLaw:
 
 
 def calibrate_multisine(
-    sweep_reference: Samples, sweep_recording: Samples, noise_recording: Samples, *, created: str = "", source: str = ""
+    sweep_reference: Samples,
+    sweep_recording: Samples,
+    noise_recording: Samples,
+    *,
+    created: str = "",
+    source: str = "",
+    sample_rate: int = SAMPLE_RATE,
 ) -> Profile:
     """Measure the robot's own voice at its microphone, and what of it no linear path explains.
 
     Parameters
     ----------
     sweep_reference : ndarray of float, shape (n,)
-        The sound of `generate_multisine` as it was played. All three at 16 kHz, full scale +-1.
-    sweep_recording, noise_recording, created, source
+        The sound of `generate_multisine` as it was played. Full scale +-1, as of all three.
+    sweep_recording, noise_recording, created, source, sample_rate
         As of `calibrate`.
 
     Returns
@@ -187,7 +194,8 @@ def calibrate_multisine(
     >>> bool(-30 < even < -20 and odd < -50)
     True
     """
-    reference, recordings, noises = checked(sweep_reference, sweep_recording, noise_recording)
+    given = (at_16_khz(x, sample_rate) for x in (sweep_reference, sweep_recording, noise_recording))
+    reference, recordings, noises = checked(*given)
     recording, noise = first(recordings), first(noises)
     law = multisine_law(reference)
     sweep = reference[: law.first]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import soxr
 from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
@@ -18,12 +17,13 @@ from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.dsp.frames import all_block_power, blocks, decibels
 from edgefilter.dsp.lag import correlation_near, highest, likely_cross, top
 from edgefilter.dsp.psd import floored, hann
+from edgefilter.dsp.resample import at_16_khz
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.lag_track import track_lag
 from edgefilter.echo.measurement import STEADY_DB, Measurement, whiten
 from edgefilter.echo.recording import fitted_blocks, paired
 from edgefilter.profile.data import Profile
-from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples, as_samples
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 TRACK_REACH = 1600
 """Samples (0.1 s) by which the lag may move away from that of the whole recording and still be followed."""
@@ -49,12 +49,7 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     recording (m,), reference (k,): float, full scale +-1, at sample_rate. Raises SignalError for less than a second or
     where the recording does not contain the reference.
     """
-    if sample_rate != SAMPLE_RATE:
-        recording, reference = (
-            soxr.resample(as_samples(x, name), sample_rate, SAMPLE_RATE)
-            for x, name in ((recording, "recording"), (reference, "reference"))
-        )
-    y, x = paired(recording, reference)
+    y, x = paired(at_16_khz(recording, sample_rate), at_16_khz(reference, sample_rate))
     n, start = y.size, profile.delay - PRE_ROLL
     model = profile.echo.during(Measurement(x, y))
     predicted = model.predict(delayed(x, start))

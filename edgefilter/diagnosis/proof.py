@@ -15,6 +15,7 @@ from edgefilter.diagnosis.joint import fit_straight
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.recording import Recording
 from edgefilter.dsp.frames import block_power, decibels
+from edgefilter.dsp.resample import at_16_khz
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.recording import BLOCK
@@ -115,7 +116,14 @@ class HeldOut:
         return float(before - after)
 
 
-def prove(profile: Profile | None, names: str | Sequence[str], recording: Samples, reference: Samples) -> Proof:
+def prove(
+    profile: Profile | None,
+    names: str | Sequence[str],
+    recording: Samples,
+    reference: Samples,
+    *,
+    sample_rate: int = SAMPLE_RATE,
+) -> Proof:
     """Say whether the running filter is better with effects than without them, on seconds that their fit has not seen.
 
     Parameters
@@ -125,8 +133,8 @@ def prove(profile: Profile | None, names: str | Sequence[str], recording: Sample
         recording and the effects.
     names : str or sequence of str
         Of the effects; of none only where there is no profile.
-    recording, reference
-        As of `diagnose`, at 16 kHz.
+    recording, reference, sample_rate
+        As of `diagnose`.
 
     Returns
     -------
@@ -159,7 +167,8 @@ def prove(profile: Profile | None, names: str | Sequence[str], recording: Sample
     >>> proof.worse, proof.erle_after_db > proof.erle_before_db + 3
     (False, True)
     """
-    return HeldOut(profile, recording, reference).proof(listed(names))
+    held = HeldOut(profile, at_16_khz(recording, sample_rate), at_16_khz(reference, sample_rate))
+    return held.proof(listed(names))
 
 
 def proofs_until_kept(

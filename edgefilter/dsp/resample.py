@@ -1,4 +1,4 @@
-"""From one sample rate to another, piece by piece, with little delay: what live sound passes on its way in and out."""
+"""From one sample rate to another: live sound piece by piece, with little delay; recordings as a whole."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import math
 from functools import lru_cache
 
 import numpy as np
+import soxr
 
 from edgefilter.dsp.fractional_delay import CHUNK
-from edgefilter.types import Samples
+from edgefilter.errors import UsageError
+from edgefilter.types import SAMPLE_RATE, Samples
 
 HALF_S = 0.0035
 """Reach of the kernel into the future, seconds: a band of 630 Hz between what passes and what is stopped."""
@@ -18,6 +20,30 @@ BETA = 6.76
 """Shape of the Kaiser window for 70 dB: 0.1102 (A - 8.7), Oppenheim & Schafer, Discrete-Time Signal Processing, 7.5.3."""
 MOST_PHASES = 512
 """Kernels that are tabulated; where the rates have more, lines between two of them err by -80 dB at most."""
+
+
+RATES = 8_000, 192_000
+"""Lowest and highest rate of a recording, Hz."""
+
+
+def at_16_khz(recording: Samples, sample_rate: int) -> Samples:
+    """A recording (n,) or (n, channels) at that rate, converted to 16 kHz; as it is where that is its rate.
+
+    Raises UsageError for a rate outside of 8 to 192 kHz. What else is wrong with it is left to those who take it.
+    """
+    if not RATES[0] <= sample_rate <= RATES[1]:
+        raise UsageError(f"sample_rate is {sample_rate}, expected {RATES[0]} to {RATES[1]} Hz")
+    if sample_rate == SAMPLE_RATE or np.ndim(recording) not in (1, 2):
+        return recording
+    return soxr.resample(recording, sample_rate, SAMPLE_RATE, quality="VHQ")
+
+
+def from_16_khz(recording: Samples, sample_rate: int, size: int) -> Samples:
+    """A recording (n,) at 16 kHz converted to that rate, (size,): as long as what was converted before."""
+    if sample_rate == SAMPLE_RATE:
+        return recording
+    converted = soxr.resample(recording, SAMPLE_RATE, sample_rate, quality="VHQ")[:size]
+    return np.pad(converted, (0, size - converted.size))
 
 
 class Resampler:

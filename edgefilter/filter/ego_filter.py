@@ -10,6 +10,7 @@ import numpy as np
 
 from edgefilter import engines
 from edgefilter.alignment.utterances import MOST_ANNOUNCED, MOST_ANNOUNCED_S
+from edgefilter.dsp.resample import at_16_khz, from_16_khz
 from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.engines.combined import Ladder, climbable, judges_speech, with_network_as_judge
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
@@ -383,17 +384,20 @@ def enhance(
     model: str | Path | None = None,
     learn: Learner | None = None,
     output: SoundFor = "recognise",
+    sample_rate: int = SAMPLE_RATE,
 ) -> Samples:
     """Filter a whole recording with its reference, by the same stream as live.
 
     Parameters
     ----------
     mic : ndarray of float, shape (n,) or (n, channels)
-        What the microphone heard, or two to eight microphones on one clock; full scale +-1, 16 kHz.
+        What the microphone heard, or two to eight microphones on one clock; full scale +-1.
     ref : ndarray of float, shape (n,)
         What the robot said, on the same sample counter.
     profile, engine, model, learn, output
         As of `EgoFilter`.
+    sample_rate : int
+        Of both, and of what is returned; the filter works at 16 kHz, so nothing above 8 kHz is left.
 
     Returns
     -------
@@ -417,4 +421,5 @@ def enhance(
     True
     """
     ego = EgoFilter(profile, engine=engine, model=model, learn=learn, output=output)
-    return np.concatenate((ego.process(mic, ref), ego.flush()))
+    human = np.concatenate((ego.process(at_16_khz(mic, sample_rate), at_16_khz(ref, sample_rate)), ego.flush()))
+    return from_16_khz(human, sample_rate, len(ref))
