@@ -6,7 +6,6 @@ import math
 from functools import lru_cache
 
 import numpy as np
-import soxr
 
 from edgefilter.dsp.fractional_delay import CHUNK
 from edgefilter.errors import UsageError
@@ -35,6 +34,8 @@ def at_16_khz(recording: Samples, sample_rate: int) -> Samples:
         raise UsageError(f"sample_rate is {sample_rate}, expected {RATES[0]} to {RATES[1]} Hz")
     if sample_rate == SAMPLE_RATE or np.ndim(recording) not in (1, 2):
         return recording
+    import soxr  # a learner beside the filter needs its memory more
+
     return soxr.resample(recording, sample_rate, SAMPLE_RATE, quality="VHQ")
 
 
@@ -42,6 +43,8 @@ def from_16_khz(recording: Samples, sample_rate: int, size: int) -> Samples:
     """A recording (n,) at 16 kHz converted to that rate, (size,): as long as what was converted before."""
     if sample_rate == SAMPLE_RATE:
         return recording
+    import soxr
+
     converted = soxr.resample(recording, SAMPLE_RATE, sample_rate, quality="VHQ")[:size]
     return np.pad(converted, (0, size - converted.size))
 
