@@ -113,8 +113,8 @@ class Event:
         which "speech_dismissed" takes back where nobody spoke. "overloaded", "stepped_down", "stepped_up": what too
         little or enough time led to. "learned", "unlearned": a better echo path was taken over, or given back.
         "reference_missing", "reference_late", "robot_unfound": the reference was silent from the start or fell silent while
-        the robot is heard, comes after its echo, or carries sound that is not found in the microphone, though that is
-        louder then. "echo_unpredicted": the echo is found, and hardly any of it can be subtracted. "same_signal": the
+        the robot is heard, comes after its echo, or carries sound that is not found in the microphone, though that
+        hears something then. "echo_unpredicted": the echo is found, and hardly any of it can be subtracted. "same_signal": the
         microphone is the reference. "rate_mismatch": a plugin's or a service's sound comes at another pace than its rate and
         channels say, or the loudspeaker plays at another one. "reference_gaps": the reference loses samples. Only from
         `edgefilter run`: "lost", "overrun", "underrun" (samples that the sound devices lost, callbacks that came too late),

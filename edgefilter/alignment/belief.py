@@ -41,13 +41,15 @@ class Belief:
 
     starts: (looks,), first sample of each second. lags: (looks,), the likeliest, samples by which the recording lags behind
     the reference, below zero where that is late. probability: (looks,), of these lags against all others and none at all.
-    late: (looks,), probability that the reference comes after its echo, by more than the filter waits for it.
+    late: (looks,), probability that the reference comes after its echo, by more than the filter waits for it. evidence: natural
+    logarithm of the odds that the recording contains the reference at all.
     """
 
     starts: Array
     lags: Array
     probability: Array
     late: Array
+    evidence: float
 
     @property
     def certain(self) -> Array:
@@ -96,7 +98,7 @@ class Belief:
         """What the seconds say that hear half a second or more of the reference from begin to end, or all of it."""
         said = self.starts - self.lags
         there = np.minimum(said + LOOK, end) - np.maximum(said, begin) >= min(LOOK // 2, end - begin)
-        return Belief(self.starts[there], self.lags[there], self.probability[there], self.late[there])
+        return Belief(self.starts[there], self.lags[there], self.probability[there], self.late[there], self.evidence)
 
 
 def believe(recording: Samples, reference: Samples) -> Belief:
@@ -118,7 +120,7 @@ def believe(recording: Samples, reference: Samples) -> Belief:
 def believed(looks: Sequence[Found]) -> Belief:
     """What looks one after the other say of the lag, as `believe` has it; a running filter asks it of its latest ones."""
     if not looks:
-        return Belief(np.zeros(0, int), *np.zeros((3, 0)))
+        return Belief(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0), 0.0)
     lags = np.array([look.lag for look in looks])
     order, state = np.argsort(lags, kind="stable"), np.zeros(lags.size, int)
     state[order[1:]] = np.cumsum(np.diff(lags[order]) > SAME)
@@ -133,7 +135,7 @@ def believed(looks: Sequence[Found]) -> Belief:
     likely, at = known[:, :-1].argmax(axis=1), np.arange(lags.size)
     nearest = np.where(state == likely[:, None], np.abs(at - at[:, None]), lags.size).argmin(axis=1)
     starts = np.array([look.at - LOOK for look in looks])
-    return Belief(starts, lags[nearest], known[at, likely], known @ late)
+    return Belief(starts, lags[nearest], known[at, likely], known @ late, evidence)
 
 
 def _after(seen: Array, anew: Array) -> tuple[Array, float]:

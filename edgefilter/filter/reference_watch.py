@@ -14,7 +14,7 @@ from edgefilter.alignment.aligner import LIKELY_LAG_S
 from edgefilter.alignment.belief import believed
 from edgefilter.alignment.delay_line import Aligned, Tape
 from edgefilter.alignment.lag_search import CERTAIN, EVEN, Found, LagSearch
-from edgefilter.alignment.utterances import FLOOR, OnsetDetector
+from edgefilter.alignment.utterances import FLOOR, VARIES, OnsetDetector, Sustained
 from edgefilter.dsp import fourier
 from edgefilter.dsp.lag import one_signal
 from edgefilter.filter.microphones import SILENT
@@ -31,9 +31,9 @@ LOOKS = 12
 DOUBT = SAMPLE_RATE // 2
 """Samples for which speech that begins while the reference is silent waits for it, until it is known to come in time: an
 onset of the robot's is no human's if the reference follows."""
-UNFOUND, LOUDER = 5 * SAMPLE_RATE, 10.0
-"""Samples of reference, 5 s, that must have played without being found, and the ratio of the microphone's power meanwhile to its power
-while the reference is silent, 10 dB, from which on the robot is heard: people who talk half of the time cause less."""
+OTHERS = 0.2
+"""Share of the looks in which the microphone hears something where the robot plays unheard, into headphones, say: people take turns with
+it; and of those in which it hears nothing where a sound is played."""
 MISSING, HEARD = 60 * SAMPLE_RATE, 10 * SAMPLE_RATE
 """Samples without any reference, of which so many were not silent at the microphone, SILENT of full scale: a level of the
 converter, since there is nothing else to compare with. 16 bits by themselves are 41 dB softer."""
@@ -70,11 +70,13 @@ class ReferenceWatch:
         self.without = self.same = False
         self._looks: deque[Found] = deque(maxlen=LOOKS)
         self._late = self._stage = self._next = self._looked = 0
-        self._missing, self._grew = "", False
+        self._missing, self._grew, self._another = "", False, False
         self._speed: float | None = None
         self._off_speed, self._to_compare, self._compared = False, 0, 0
         self._idle = True
-        self._power = {"unfound": [0.0, 0], "idle": [0.0, 0]}
+        self._sustained, self._loudest, self._least = Sustained(), 0.0, float("inf")
+        self._rise = 10 ** (hop / (10 * SAMPLE_RATE))
+        self._levels: deque[float] = deque(maxlen=LOOKS)
         self._sound = RobotSound(hop, bins)
         self._played, self._played_at = 0.0, -LATEST
         self._products, self._sounding = np.zeros(3), 0
@@ -108,12 +110,15 @@ class ReferenceWatch:
         self._mic.push(mic)
         self._ref.push(ref)
         if self._onsets.step(ref):
-            self._next = self._ref.end + DOUBT
+            self._next, self._loudest = self._ref.end + DOUBT, 0.0
         self._idle = aligned.state in ("idle", "announced")  # what was announced is no reference before it is heard
         power, played = float(mic.dot(mic)) / self._hop, float(ref.dot(ref)) / self._hop
+        self._loudest = max(self._loudest, self._sustained.step(power))
+        if power > FLOOR:
+            self._least = min(power, self._rise * self._least)
         checks: tuple[tuple[EventKind, str], ...] = (
             ("reference_late", self._look(aligned)),
-            ("robot_unfound", self._weigh(power, aligned)),
+            ("robot_unfound", self._unheard(aligned)),
             ("echo_unpredicted", self._unpredicted(removal)),
             ("same_signal", self._same(pre_emphasised(mic), pre_emphasised(ref))),
             ("reference_gaps", self._lacks_samples()),
@@ -218,7 +223,10 @@ class ReferenceWatch:
         )
 
     def _look(self, aligned: Aligned) -> str:
-        """Take a look, in three hops, or the lag that the aligner follows for one; say once that the reference is late."""
+        """Take a look, in three hops, or the lag that the aligner follows for one; say once that the reference is late.
+
+        Of a robot that is heard some looks show the lag, of one that is not heard few a voice: where neither can be, it is another sound.
+        """
         now, stage, self._stage = self._ref.end, self._stage, 0
         found = None
         if aligned.state in ("locked", "coarse") and self.verdict != "late":
@@ -240,10 +248,13 @@ class ReferenceWatch:
         self._looks.append(found if found.clearness > EVEN else replace(found, clearness=0.0))
         belief = believed(self._looks)
         self._grew, late = bool((belief.steps[0][-1:] > 0).any()), belief.late[-1]
-        if (
-            belief.missing or belief.lossy <= 1.0
-        ):  # what was certain is believed as long as any look still speaks for it
+        if belief.missing or belief.lossy <= 1.0:  # once certain, as long as any look speaks for it
             self._missing = belief.missing
+        if self._onsets.varies:
+            self._levels.append(self._loudest / self._least)
+        sounding = 2 * sum(level > VARIES for level in self._levels) - len(self._levels)
+        unlike = np.logaddexp(belief.evidence, sounding * math.log(OTHERS / (1.0 - OTHERS)))
+        self._another, self._loudest = bool(unlike < -math.log(CERTAIN)), 0.0
         if late > CERTAIN / (CERTAIN + 1.0):
             self.verdict = "late"
         elif late < 1.0 / (CERTAIN + 1.0):
@@ -257,24 +268,16 @@ class ReferenceWatch:
             " or are the two swapped?"
         )
 
-    def _weigh(self, power: float, aligned: Aligned) -> str:
-        """Compare the microphone's power while the reference plays but is not found with that while the reference is silent."""
+    def _unheard(self, aligned: Aligned) -> str:
+        """Say that the microphone hears something while the reference plays, but not the reference."""
         if aligned.state == "locked":
-            self._power["unfound"] = [0.0, 0]
             self._said.discard("unfound")
-        if aligned.state in self._power and not self._displaced:
-            entry = self._power[aligned.state]
-            entry[0] += power
-            entry[1] += self._hop
-        (unfound, samples), (idle, before) = self._power["unfound"], self._power["idle"]
-        if samples < UNFOUND or before < SAMPLE_RATE:
-            return ""
-        ratio = (unfound / samples) / max(idle / before, 1e-12)
-        if ratio < LOUDER or not self._once("unfound"):
+        if not self._another or self._displaced or not self._once("unfound"):
             return ""
         return (
-            f"the microphone is {10 * np.log10(ratio):.0f} dB louder while the reference carries sound, which is not found"
-            " in it: it is another sound than the loudspeaker's, too late, or processed on the way; 'edgefilter doctor'"
+            f"the microphone is {10 * math.log10(max(self._levels)):.0f} dB louder than its silence while the reference carries"
+            " sound, which is not found in it: it is another sound than the loudspeaker's, too late, or processed on the way,"
+            " or the loudspeaker is muted; 'edgefilter doctor'"
         )
 
     def _wait_for_any(self, power: float, played: float) -> str:
