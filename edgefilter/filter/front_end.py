@@ -13,6 +13,7 @@ from edgefilter.echo.running import SourceChain
 from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.filter.canceller import Canceller, CancellerOutput
 from edgefilter.filter.echo_path import PAST, EchoPath, FilteredHop, Learner, Lesson, starting_path
+from edgefilter.filter.hum import Hum
 from edgefilter.filter.microphones import Microphones
 from edgefilter.filter.removal import Removal
 from edgefilter.filter.residual_echo import Residual, Unpredictable
@@ -115,7 +116,7 @@ class FrontEnd:
     cut: (bins,) gain of every spectrum, None for 1. microphones: of an array, and None for a single one; the kinds without a
     linear stage hear its first. spatial: None but for "full" with an array. errors: (microphones, bins) of the latest frame
     of an array. linear: what the linear stage made of the latest hop. heard: the microphone's latest hop, (hop,), without
-    its offset.
+    its offset and hum.
     """
 
     def __init__(
@@ -152,7 +153,7 @@ class FrontEnd:
         self.cut: Samples | None = None
         if self.linear_stage and not profile:
             self.cut = np.where(stft.frequencies < RUMBLE_HZ, np.float32(RUMBLE), np.float32(1.0))
-        self._centred = Centred(stft.hop)
+        self._centred, self._hum = Centred(stft.hop), Hum(stft.hop)
         self.heard = np.zeros(stft.hop, np.float32)
         self._tail: Samples | None = None
         self._nothing = np.zeros(stft.bins, np.float32)
@@ -164,7 +165,7 @@ class FrontEnd:
         """One hop (hop,) of microphone, of an array (microphones, hop), and reference to a frame, with what the aligner found."""
         stage = self.linear_stage
         if stage:
-            mic = self._centred.step(mic)
+            mic = self._hum.step(self._centred.step(mic))
         heard, mic = mic, self.first_of(mic)
         self.heard = mic
         if stage is None:
