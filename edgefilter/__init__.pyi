@@ -6,12 +6,12 @@ from .calibration.multisine import calibrate_multisine as calibrate_multisine
 from .calibration.multisine import generate_multisine as generate_multisine
 from .calibration.sweep import generate_sweep as generate_sweep
 from .diagnosis.compare import Comparison as Comparison
-from .diagnosis.compare import compare as compare
-from .diagnosis.diagnose import add as add
-from .diagnosis.diagnose import diagnose as diagnose
 from .diagnosis.proof import Proof as Proof
-from .diagnosis.proof import prove as prove
-from .diagnosis.proven import diagnose_proven as diagnose_proven
+from .diagnosis.recording import Recording as Recording
+from .diagnosis.recording import add as add
+from .diagnosis.recording import compare as compare
+from .diagnosis.recording import diagnose as diagnose
+from .diagnosis.recording import prove as prove
 from .diagnosis.result import Diagnosis as Diagnosis
 from .diagnosis.result import Finding as Finding
 from .diagnosis.result import Interval as Interval

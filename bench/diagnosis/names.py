@@ -25,7 +25,7 @@ from bench.metrics import counted
 from bench.provenance import DIAGNOSIS
 from bench.recordings import CALIBRATION, progress, read
 from edgefilter.calibration.calibrate import calibrate
-from edgefilter.diagnosis.diagnose import diagnose
+from edgefilter.diagnosis.recording import diagnose
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.errors import UsageError
 from edgefilter.types import Samples

@@ -23,7 +23,8 @@ from bench.simulate.asked_robot import AskedRobot, make
 from bench.simulate.conversations import read_voices
 from edgefilter.calibration.calibrate import calibrate
 from edgefilter.calibration.sweep import generate_sweep
-from edgefilter.diagnosis.probe import ENOUGH, SOUND_S, Inquiry, weights
+from edgefilter.diagnosis.probe import ENOUGH, SOUND_S, weights
+from edgefilter.diagnosis.recording import Recording
 from edgefilter.errors import SignalError
 from edgefilter.types import Array
 
@@ -70,7 +71,9 @@ def outcome(likely: Array, true: int, holds: bool = True) -> str:
 
 def examine(robot: AskedRobot, pair: tuple[str, str], strength: str) -> Row:
     """The row of one robot; open is also what cannot be asked, or was not heard."""
-    inquiry = Inquiry(calibrate(*robot.calibration), [(name,) for name in pair], robot.recording, robot.reference)
+    inquiry = Recording(robot.recording, robot.reference, calibrate(*robot.calibration)).probe(
+        [(name,) for name in pair]
+    )
     true, peak = pair.index(robot.truth), float(np.abs(robot.reference).max())
     if len(inquiry.explanations) < len(pair):
         return Row(pair, robot.truth, strength, ("open",) * len(WAYS))

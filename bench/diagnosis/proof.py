@@ -23,10 +23,9 @@ from bench.metrics import counted
 from bench.provenance import DIAGNOSIS
 from bench.recordings import CALIBRATION, find_recordings
 from edgefilter.calibration.calibrate import calibrate
-from edgefilter.calibration.from_recording import self_calibrate
-from edgefilter.diagnosis.diagnose import diagnose
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.proof import WORSE_DB, HeldOut, lasts, proofs_until_kept
+from edgefilter.diagnosis.proof import WORSE_DB, lasts
+from edgefilter.diagnosis.recording import Recording
 from edgefilter.diagnosis.result import in_order
 from edgefilter.dsp.frames import blocks, decibels, frames
 from edgefilter.dsp.psd import floored, periodograms
@@ -63,15 +62,16 @@ class Row:
 def examine(name: str, profile: Profile | None, y: Samples, x: Samples) -> Row:
     """The row of recording y (n,) of the robot saying x (n,); profile None: one is made from the recording."""
     try:
-        cut = HeldOut(profile, y, x).cut
-        start = profile or self_calibrate(y[:cut], x[:cut])
-        found = diagnose(start, y[:cut], x[:cut])
+        held = Recording(y, x, profile).held_out
+        cut = held.cut
+        first = Recording(y[:cut], x[:cut], profile)
+        start, found = first.profile, first.diagnose()
         named = tuple(finding.effect for finding in in_order(found.ranking))
         noise = noise_off_db(start, found.model, y, x, cut) if any(find(e).stage == "noise" for e in named) else None
         kept = tuple(effect for effect in named if lasts(effect))
         if not kept and profile is not None:
             return Row(name, named, noise_db=noise)
-        proofs = proofs_until_kept(profile, kept, y, x)
+        proofs = held.until_kept(kept)
     except EdgefilterError as error:
         return Row(name, declined=str(error))
     first, last = proofs[0], proofs[-1]

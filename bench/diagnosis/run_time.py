@@ -20,7 +20,7 @@ from bench.simulate.conversations import read_clips, read_voices
 from bench.simulate.hidden_cases import EffectConversation, make_conversation
 from bench.simulate.simulated_robot import RATE
 from edgefilter import Profile, calibrate, enhance
-from edgefilter.diagnosis.diagnose import add
+from edgefilter.diagnosis.recording import add
 from edgefilter.dsp.metrics import erle, si_sdr
 from edgefilter.echo.effects.catalogue import EFFECTS, find
 from edgefilter.echo.running import reach

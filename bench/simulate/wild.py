@@ -442,7 +442,7 @@ UNTRIED: tuple[Program, ...] = (
     Program("mp2", "source", ("codec",),
             lambda r: coded(f"ffmpeg -y -i {{wav}} -c:a mp2 -b:a {r.choice([16, 24, 32])}k -f mp2 {{packed}}", "ffmpeg -y -f mp3 -i {packed} {out}")),
 )
-"""Programs of DPF and further ones of SoX and ffmpeg: not run before a change of the diagnosis is done (--seed 6157 --count 30)."""
+"""Programs of DPF and further ones of SoX and ffmpeg: run once (--seed 6157 --count 30), after a change of the diagnosis was done."""
 # fmt: on
 
 HALVES = {"tuning": TUNING, "reporting": REPORTING, "unseen": UNSEEN, "untried": UNTRIED}

@@ -11,8 +11,9 @@ import numpy as np
 from edgefilter.commands.display import print_result, progress
 from edgefilter.commands.recordings import load
 from edgefilter.diagnosis.compare import Comparison
-from edgefilter.diagnosis.diagnose import PROMISE_DB, Diagnosis, add, settle
-from edgefilter.diagnosis.proof import Proof, proofs_until_kept, prove
+from edgefilter.diagnosis.proof import Proof
+from edgefilter.diagnosis.recording import PROMISE_DB, Recording
+from edgefilter.diagnosis.result import Diagnosis
 from edgefilter.echo.effect import Effect
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.measurement import Values
@@ -20,16 +21,15 @@ from edgefilter.echo.running import reach
 from edgefilter.errors import EdgefilterError, SignalError
 from edgefilter.profile.data import Profile
 from edgefilter.report.text import UNITS, decibels, figure, joined, proof_line
-from edgefilter.types import Samples
 
 
 def main(args: argparse.Namespace) -> None:
     names = tuple(dict.fromkeys(args.effect))
     for name in names:
         find(name)
-    profile, recording, reference = load(args)
+    recording = load(args)
     with progress("fit, and proof in the running filter"):
-        fitted = fit(profile, profile, names, recording, reference, force=args.force)
+        fitted = fit(recording, names, force=args.force)
     fitted.profile.save(args.output)
     lines = [*fitted.lines(), f"written to {args.output}"]
     print_result(args, lines, {"schema": 2, **fitted.to_dict(), "output": args.output})
@@ -113,29 +113,19 @@ class Fitted:
         return lines
 
 
-def fit(
-    profile: Profile | None,
-    start: Profile,
-    names: tuple[str, ...],
-    recording: Samples,
-    reference: Samples,
-    *,
-    force: bool,
-    found: Diagnosis | None = None,
-) -> Fitted:
-    """The effects fitted to the recording on top of start, and proven against profile.
+def fit(recording: Recording, names: tuple[str, ...], *, force: bool, found: Diagnosis | None = None) -> Fitted:
+    """The effects fitted to the recording on top of its profile, and proven.
 
-    start: the profile, or one made from the recording where there is none. found: the diagnosis that named them: then an
-    effect that makes the filter worse is left out where the others help. Raises Refused where the filter would be worse,
-    unless force.
+    found: the diagnosis that named them: then an effect that makes the filter worse is left out where the others help.
+    Raises Refused where the filter would be worse, unless force.
     """
     proofs: tuple[Proof, ...] = ()
     unproven = "there is nothing to prove"
     try:
-        if (names or profile is None) and found and not force:
-            proofs = proofs_until_kept(profile, names, recording, reference)
-        elif names or profile is None:
-            proofs = (prove(profile, names, recording, reference),)
+        if (names or not recording.known) and found and not force:
+            proofs = recording.held_out.until_kept(names)
+        elif names or not recording.known:
+            proofs = (recording.prove(names),)
     except SignalError as error:
         if not force:
             raise
@@ -145,11 +135,11 @@ def fit(
     names = tuple(name for name in names if name not in dropped)
     if proof and proof.worse and not force:
         raise Refused(_refusal(proof))
-    if found and profile and names:
-        knowing, after, told = settle(profile, found, names, recording, reference)
+    if found and recording.known and names:
+        knowing, after, told = recording.settle(found, names)
         before = found.comparison if told is found else told.comparison
         return Fitted(names, dropped, knowing, before, after, proof, unproven, told, found.remaining_db)
-    return Fitted(names, dropped, *add(start, names, recording, reference), proof, unproven, found)
+    return Fitted(names, dropped, *recording.add(names), proof, unproven, found)
 
 
 def _figures(effect: Effect, values: Values) -> dict[str, Any]:

@@ -7,17 +7,16 @@ from dataclasses import replace
 
 from edgefilter.commands.display import print_result, progress, report_part
 from edgefilter.commands.recordings import load
-from edgefilter.diagnosis.compare import compare
 from edgefilter.report.text import comparison_lines
 
 
 def main(args: argparse.Namespace) -> None:
     html = report_part("html") if args.report else None
-    profile, recording, reference = load(args)
+    recording = load(args)
     with progress("comparison"):
-        found = compare(profile, recording, reference)
+        found = recording.compare()
     if args.profile is None:
-        found = replace(found, warnings=(*profile.warnings, *found.warnings))
+        found = replace(found, warnings=(*recording.profile.warnings, *found.warnings))
     print_result(args, comparison_lines(found), {"schema": 1, **found.to_dict()})
     if html:
         html.write_page(args.report, html.comparison_page(found, vars(args)))

@@ -16,8 +16,7 @@ from edgefilter.audio.files import FileSink, FileSource, write_file
 from edgefilter.commands.add import Fitted, fit
 from edgefilter.commands.display import describe_latency, print_result, progress, report_part, say
 from edgefilter.commands.outputs import CASES
-from edgefilter.diagnosis.compare import compare
-from edgefilter.diagnosis.diagnose import diagnose
+from edgefilter.diagnosis.recording import Recording
 from edgefilter.diagnosis.result import in_order
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.engines import NEEDS_PROFILE
@@ -133,14 +132,15 @@ def _mend(name: str, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     changed = f"robot {name}: something about it has changed since its calibration (simulated)"
     print_result(args, [changed, f"$ edgefilter compare {files}"])
     with progress(f"robot {name}: comparison"):
-        excess_db = compare(case.profile, case.mic, case.reference).excess_db
+        recording = Recording(case.mic, case.reference, case.profile)
+        excess_db = recording.compare().excess_db
     excess = f"  its own voice is {decibels(excess_db)} dB over the noise floor after the prediction"
     print_result(args, [excess, f"$ edgefilter diagnose {files} {made}"])
     with progress(f"robot {name}: diagnosis") as step:
-        found = diagnose(case.profile, case.mic, case.reference, progress=step)
+        found = recording.diagnose(progress=step)
         step("fit of what was found, and proof in the running filter")
         names = tuple(finding.effect for finding in in_order(found.ranking))
-        applied = fit(case.profile, case.profile, names, case.mic, case.reference, force=False, found=found)
+        applied = fit(recording, names, force=False, found=found)
         applied.profile.save(folder / "better.npz")
     named = [finding.effect for finding in found.ranking]
     added, *more = applied.lines()
@@ -154,7 +154,7 @@ def _mend(name: str, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
             filtered[kept] = enhance(case.talk, case.talk_reference, profile, engine=args.engine)
             write_file(folder / f"human_{kept}.wav", filtered[kept])
         step("drawing the page and the picture")
-        drawn = _draw_mended(folder, case, applied, filtered)
+        drawn = _draw_mended(folder, case, recording, applied, filtered)
     sdr = {"microphone": case.talk, **filtered}
     figures = {
         "hidden": case.truth["effects"],
@@ -177,13 +177,15 @@ def _mend(name: str, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     return figures
 
 
-def _draw_mended(folder: Path, case: Case, applied: Fitted, filtered: dict[str, Samples]) -> list[str]:
+def _draw_mended(
+    folder: Path, case: Case, recording: Recording, applied: Fitted, filtered: dict[str, Samples]
+) -> list[str]:
     """The page of the diagnosis that was applied, and the conversation before and after."""
     html, plots = _drawer("html"), _drawer("plots")
     if not html or not plots:
         return []
     names = {"profile": "robot.npz", "recording": "mic.wav", "reference": "tts.wav", "apply": "better.npz"}
-    page = html.diagnosis_page(case.profile, applied.found, case.mic, case.reference, names, applied.facts())
+    page = html.diagnosis_page(recording, applied.found, names, applied.facts())
     html.write_page(folder / "report.html", page)
     sounds = {
         "microphone: the robot talks, and a human interrupts it": case.talk,

@@ -12,16 +12,13 @@ from edgefilter.commands.add import Fitted, Refused, fit
 from edgefilter.commands.display import print_result, progress, report_part
 from edgefilter.commands.recordings import load, load_array
 from edgefilter.diagnosis.criteria import Criteria
-from edgefilter.diagnosis.diagnose import Diagnosis, diagnose
-from edgefilter.diagnosis.proven import diagnose_proven
-from edgefilter.diagnosis.result import in_order
+from edgefilter.diagnosis.recording import Recording
+from edgefilter.diagnosis.result import Diagnosis, in_order
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.effects.catalogue import names as known_effects
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
 from edgefilter.profile.array import ArrayCalibration
-from edgefilter.profile.data import Profile
 from edgefilter.report.text import LINES, MORE, add_command, diagnosis_lines, next_command, summary_lines
-from edgefilter.types import Samples
 
 
 def main(args: argparse.Namespace) -> None:
@@ -37,20 +34,20 @@ def main(args: argparse.Namespace) -> None:
     if args.mic_channels is None:
         if args.channel is not None:
             raise UsageError("found --channel without --mic-channels, which names the microphones: give both")
-        profile, recording, reference = load(args)
+        recording = load(args)
     else:
-        profile, recording, reference, array, doubts = load_array(args)
+        recording, array, doubts = load_array(args)
         print_result(args, [f"channel {number}: {what}" for number, what in doubts.items()])
     with progress("diagnosis") as step:
         criteria = Criteria(false_rate=args.false_rate)
-        diagnosed = diagnose_proven if args.prove else diagnose
-        found = diagnosed(profile, recording, reference, progress=step, criteria=criteria)
-        if args.profile is None:
-            warnings = (*profile.warnings, *found.comparison.warnings)
+        diagnosed = recording.diagnose_proven if args.prove else recording.diagnose
+        found = diagnosed(progress=step, criteria=criteria)
+        if not recording.known:
+            warnings = (*recording.profile.warnings, *found.comparison.warnings)
             found = replace(found, comparison=replace(found.comparison, warnings=warnings))
         applied, refused = None, None
         if args.apply:
-            applied, refused = _apply(profile, found, recording, reference, args, step, array)
+            applied, refused = _apply(recording, found, args, step, array)
     more: dict[str, object] = {"channels": {str(number): what for number, what in doubts.items()}} if doubts else {}
     if applied:
         more["applied"] = {**applied.to_dict(), "output": args.apply}
@@ -64,7 +61,7 @@ def main(args: argparse.Namespace) -> None:
     if args.write_effect:
         own, following = _written(args, found, following)
         told.append(own)
-    calibrated = args.profile is not None
+    calibrated = recording.known
     if args.verbose:
         lines = [*diagnosis_lines(found, calibrated), *told]
     else:
@@ -73,7 +70,7 @@ def main(args: argparse.Namespace) -> None:
     if html:
         with progress("page of the diagnosis"):
             outcome = applied.facts() if applied else ()
-            html.write_page(args.report, html.diagnosis_page(profile, found, recording, reference, vars(args), outcome))
+            html.write_page(args.report, html.diagnosis_page(recording, found, vars(args), outcome))
         print_result(args, [f"report      {args.report}"])
     if refused:
         raise refused
@@ -81,10 +78,8 @@ def main(args: argparse.Namespace) -> None:
 
 
 def _apply(
-    profile: Profile,
+    recording: Recording,
     found: Diagnosis,
-    recording: Samples,
-    reference: Samples,
     args: argparse.Namespace,
     step: Callable[[str], None],
     array: ArrayCalibration | None,
@@ -96,14 +91,13 @@ def _apply(
     """
     step("fit of what was found, and proof in the running filter")
     names = [finding.effect for finding in in_order(found.ranking)]
-    start = None if args.profile is None else profile
-    if start is None:
+    if not recording.known:
         # a path of a quarter of a second was made from the recording
         names += [name for name in known_effects() if find(name).lengthens]
     if not names:
         return None, None
     try:
-        applied = fit(start, profile, tuple(names), recording, reference, force=args.force, found=found)
+        applied = fit(recording, tuple(names), force=args.force, found=found)
     except (Refused, SignalError) as error:
         return None, error
     replace(applied.profile, array=array or applied.profile.array).save(args.apply)

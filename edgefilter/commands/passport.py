@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 
-from edgefilter.calibration.from_recording import self_calibrate
 from edgefilter.commands.demo import speaking
 from edgefilter.commands.display import print_result, progress, report_part
 from edgefilter.commands.recordings import read
-from edgefilter.diagnosis.diagnose import Diagnosis, diagnose
 from edgefilter.diagnosis.passport import ENGINES, MOST_S, measure
+from edgefilter.diagnosis.recording import Recording
+from edgefilter.diagnosis.result import Diagnosis
 from edgefilter.errors import SignalError
 from edgefilter.filter.budget import DEMO
 from edgefilter.report.passport import expectation, lines
@@ -41,7 +41,7 @@ def _diagnosed(recording: Samples, reference: Samples, step: Callable[[str], Non
     """What the diagnosis names, without a profile, and in a sentence; or why it names nothing."""
     step("diagnosis")
     try:
-        found = diagnose(self_calibrate(recording, reference), recording, reference, progress=step)
+        found = Recording(recording, reference).diagnose(progress=step)
     except SignalError as error:
         return None, f"not possible: {error}"
     return found, headline(found.verdict, [finding.effect for finding in found.ranking], calibrated=False)

@@ -17,13 +17,12 @@ from edgefilter.commands.display import print_result, progress, write_json
 from edgefilter.commands.outputs import question_of
 from edgefilter.commands.recordings import load, read, read_voice
 from edgefilter.diagnosis.advice import RIVAL, remaining
-from edgefilter.diagnosis.diagnose import diagnose
 from edgefilter.diagnosis.probe import ENOUGH, SOUND_S, Answer, Inquiry
+from edgefilter.diagnosis.recording import Recording
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.errors import AudioFileError, SignalError, UsageError
 from edgefilter.profile.data import Profile
 from edgefilter.report.text import add_command, files_given, joined
-from edgefilter.types import Samples
 
 SCHEMA = 1
 """Of the question beside a sound."""
@@ -40,11 +39,11 @@ def main(args: argparse.Namespace) -> None:
     if args.reference is None:
         _evaluate(args)
         return
-    profile, recording, reference = load(args)
+    recording = load(args)
     with progress("explanations that remain") as step:
         if not wanted:
-            wanted = list(remaining(diagnose(profile, recording, reference, progress=step).tried))
-        inquiry = _inquiry(profile, wanted, recording, reference)
+            wanted = list(remaining(recording.diagnose(progress=step).tried))
+        inquiry = _inquiry(recording, wanted)
     print_result(args, [f"asked       {joined(one.name for one in inquiry.explanations)}: which of them it is"])
     if args.excitation:
         _write(args, inquiry)
@@ -53,7 +52,7 @@ def main(args: argparse.Namespace) -> None:
         _tell(args, answer, vars(args))
 
 
-def _inquiry(profile: Profile, wanted: list[tuple[str, ...]], recording: Samples, reference: Samples) -> Inquiry:
+def _inquiry(recording: Recording, wanted: list[tuple[str, ...]]) -> Inquiry:
     """Two explanations or more, fitted. Raises SignalError where there is nothing to ask."""
     if not wanted:
         raise SignalError("nothing to ask: the diagnosis names nothing that another recording would show")
@@ -62,7 +61,7 @@ def _inquiry(profile: Profile, wanted: list[tuple[str, ...]], recording: Samples
         raise SignalError(
             f"nothing to ask: {first} is named, and nothing else explains {100 * RIVAL:.0f} % of what it does"
         )
-    inquiry = Inquiry(profile, wanted, recording, reference)
+    inquiry = recording.probe(wanted)
     if len(inquiry.explanations) < 2:
         raise SignalError(f"nothing to ask: {joined([first, *others])} predict the same, under other names")
     return inquiry
@@ -104,7 +103,7 @@ def _evaluate(args: argparse.Namespace) -> None:
     recording, reference = (read_voice(question[role], role) for role in ("recording", "reference"))
     with progress("the answer"):
         wanted = [tuple(text.split("+")) for text in question["explanations"]]
-        inquiry = _inquiry(profile, wanted, recording, reference)
+        inquiry = _inquiry(Recording(recording, reference, profile), wanted)
         heard = inquiry.hear(answer, sound)
         told = inquiry.answer([heard], [inquiry.gains(sound)], tuple(question["sounds"]))
     _tell(args, told, {**vars(args), **question, "profile": args.profile})

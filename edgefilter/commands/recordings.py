@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from edgefilter.audio.reader import Reader
-from edgefilter.calibration.from_recording import self_calibrate
 from edgefilter.commands.display import say
 from edgefilter.diagnosis.channels import doubtful_channels
+from edgefilter.diagnosis.recording import Recording
 from edgefilter.errors import AudioFileError, UsageError
 from edgefilter.profile.array import ArrayCalibration
 from edgefilter.profile.data import Profile
@@ -32,18 +32,18 @@ def _whole(reader: Reader) -> Samples:
     return np.concatenate(list(reader.chunks()))
 
 
-def load(args: argparse.Namespace) -> tuple[Profile, Samples, Samples]:
-    """Profile, recording (n,) of the robot alone and reference (m,) of what it said; 16 kHz mono.
+def load(args: argparse.Namespace) -> Recording:
+    """The recording of the robot alone, what it said, and the profile.
 
     Without --profile the profile is made from the recording. Raises AudioFileError for a file that is unusable or holds
     only silence, ProfileError for a damaged profile, SignalError where no profile can be made from the recording.
     """
     profile = None if args.profile is None else Profile.load(args.profile)
     recording, reference = read_voice(args.recording, "recording"), read_voice(args.reference, "reference")
-    return profile or self_calibrate(recording, reference), recording, reference
+    return Recording(recording, reference, profile)
 
 
-def load_array(args: argparse.Namespace) -> tuple[Profile, Samples, Samples, ArrayCalibration | None, dict[int, str]]:
+def load_array(args: argparse.Namespace) -> tuple[Recording, ArrayCalibration | None, dict[int, str]]:
     """As load, of the microphone --channel of the recording's --mic-channels; the profile is of this microphone alone.
 
     And what the whole profile holds of the others, and what is wrong with any, by channel. Raises as load, SignalError for
@@ -65,11 +65,11 @@ def load_array(args: argparse.Namespace) -> tuple[Profile, Samples, Samples, Arr
     if not recordings[at].any():
         raise AudioFileError(f"channel {number} of {args.recording} is silent: every sample is zero, choose another")
     if args.profile is None:
-        return self_calibrate(recordings[at], reference), recordings[at], reference, None, {}
+        return Recording(recordings[at], reference), None, {}
     profile, recordings = Profile.load(args.profile), np.ascontiguousarray(recordings)
     doubts = doubtful_channels(profile, recordings, reference)
     found = {wanted[index]: what for index, what in doubts.items()}
-    return profile.of_microphone(at), recordings[at], reference, profile.array, found
+    return Recording(recordings[at], reference, profile.of_microphone(at)), profile.array, found
 
 
 def read_voice(path: str, role: str) -> Samples:

@@ -9,8 +9,8 @@ import numpy as np
 
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.ordinary import percent
-from edgefilter.diagnosis.recording import HOP, STEP, bands
 from edgefilter.diagnosis.result import Candidate, Fate
+from edgefilter.diagnosis.straightened import HOP, STEP, bands
 from edgefilter.diagnosis.trials import Found, Tried
 from edgefilter.echo.effect import neutral
 from edgefilter.echo.effects.catalogue import find

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from edgefilter.diagnosis.criteria import Criteria
+from edgefilter.diagnosis.straightened import bands
 from edgefilter.diagnosis.trials import Found, Trial
 from edgefilter.dsp.frames import decibels, frames
 from edgefilter.dsp.psd import GRID_FFT, frequencies, periodograms
@@ -14,7 +15,6 @@ from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.effects.free_laws import FreeLaw
 from edgefilter.types import Array
 
-BANDS_HZ = np.geomspace(100.0, 7800.0, 20)
 SILENCES = "frequency, in the robot's silences"
 
 
@@ -86,6 +86,7 @@ def _silences(found: Found) -> Curve | None:
         return None
     left = recording.measurement.recording - found.final.prediction
     ratio = periodograms(left, GRID_FFT)[silent].mean(axis=0) / recording.noise_psd
-    place = np.digitize(frequencies(ratio.size), BANDS_HZ)
-    y = [float(decibels(ratio[place == k].mean())) for k in range(1, BANDS_HZ.size)]
-    return Curve.of(SILENCES, "Hz", np.sqrt(BANDS_HZ[1:] * BANDS_HZ[:-1]), np.array(y), 0.0)
+    low, high = bands().hz.T
+    place = np.digitize(frequencies(ratio.size), (*low, high[-1]))
+    y = [float(decibels(ratio[place == k].mean())) for k in range(1, low.size + 1)]
+    return Curve.of(SILENCES, "Hz", np.sqrt(low * high), np.array(y), 0.0)

@@ -1,4 +1,4 @@
-"""Compare what the profile predicts of the robot's own voice with a recording of it: how much is left, and where."""
+"""How far what a model predicts of the robot's own voice is from a recording of it, and where."""
 
 from __future__ import annotations
 
@@ -11,15 +11,13 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from edgefilter.diagnosis.independence import Independence, independence
-from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.recording import Recording, Score
+from edgefilter.diagnosis.straightened import Score, Straightened
 from edgefilter.dsp.frames import block_power, blocks, decibels, frames
 from edgefilter.dsp.psd import frequencies, periodograms, total_power
 from edgefilter.echo.effects.catalogue import chain
 from edgefilter.echo.measurement import whiten
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.recording import BLOCK
-from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 BAND_EDGES = (60.0, 125.0, 250.0, 500.0, 1000.0, 1500.0, 2000.0, 3000.0, 4000.0, 5000.0, 6000.0, 7000.0, 7800.0)
@@ -36,7 +34,7 @@ class Comparison:
 
     Decibels of excess are of the residual, whitened by the fan's PSD, over the fan.
 
-    excess_db: of the samples that no diagnosis fits on, every second half second, as Recording scores them: the one figure
+    excess_db: of the samples that no diagnosis fits on, every second half second, as Straightened scores them: the one figure
     that compare, add, diagnose and the report show; 0 means that nothing is unexplained. All else is of the whole.
     noise_floor_db: the fan, dB re full scale. bands: (low_hz, high_hz, excess_db). times: (start_s, end_s, excess_db).
     levels: (low_dbfs, high_dbfs, excess_db) by the level of the predicted voice. lags: (low_ms, high_ms, share) of the
@@ -78,53 +76,7 @@ def rounded(value: Any, digits: int = 4) -> Any:
     return value
 
 
-def compare(profile: Profile, recording: Samples, reference: Samples, *, sample_rate: int = SAMPLE_RATE) -> Comparison:
-    """Say how far the profile's prediction of the robot's own voice is from a recording of it, and where.
-
-    Parameters
-    ----------
-    profile : Profile
-        What is held against the recording.
-    recording : ndarray of float, shape (m,)
-        The robot alone at its microphone, some seconds, full scale +-1.
-    reference : ndarray of float, shape (n,)
-        What it said, as sent to the loudspeaker.
-    sample_rate : int
-        Of both; they are converted to 16 kHz.
-
-    Returns
-    -------
-    Comparison
-        Excess over the noise floor in all, by frequency, time, level and lag.
-
-    Raises
-    ------
-    SignalError
-        Where the recording does not contain the reference.
-
-    Notes
-    -----
-    Excess is the power of recording minus prediction, whitened by the fan's power spectral density, over the fan's own:
-    0 dB where nothing is left to explain. A constant lag of up to 3 s either way and the ordinary
-    tolerances of path and fan are taken out.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from edgefilter import calibrate, generate_sweep
-    >>> rng, sweep = np.random.default_rng(0), generate_sweep()
-    >>> fan = lambda n: 1e-3 * rng.standard_normal(n).astype(np.float32)
-    >>> profile = calibrate(sweep, 0.5 * np.roll(sweep, 300) + fan(sweep.size), fan(64_000))
-    >>> said = (0.2 * rng.standard_normal(80_000) * np.repeat(rng.uniform(size=25) > 0.3, 3200)).astype(np.float32)
-    >>> heard = 0.4 * np.roll(said, 300) + fan(said.size)
-    >>> compare(profile, heard, said).excess_db > 20
-    True
-    """
-    prepared = prepare(profile, recording, reference, sample_rate=sample_rate)
-    return describe(prepared, prepared.model)
-
-
-def describe(prepared: Recording, model: EchoModel, score: Score | None = None) -> Comparison:
+def describe(prepared: Straightened, model: EchoModel, score: Score | None = None) -> Comparison:
     """The comparison of a prepared recording with what a model predicts; score: of that model, where it is known.
 
     A gain of the microphone is taken out of the residual before that is held against the fan, which passed it as well.
@@ -164,7 +116,7 @@ def describe(prepared: Recording, model: EchoModel, score: Score | None = None) 
     )
 
 
-def independence_of(prepared: Recording, model: EchoModel, score: Score) -> Independence | None:
+def independence_of(prepared: Straightened, model: EchoModel, score: Score) -> Independence | None:
     """Whether what a model leaves is noise, see `independence`; score: of that model."""
     prepared = prepared.behind(model)
     measurement, use, active = prepared.measurement, prepared.usable, prepared.active

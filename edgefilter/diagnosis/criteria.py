@@ -31,9 +31,6 @@ class Criteria:
     """Where no more than this share is left, the right effects may be found already, and no richer one is tried."""
 
     # Forward: which effect is the next
-    long_filter: int = 4
-    """Complexity of long filters: half a minute does not teach all their taps, so what they leave of the samples fitted
-    to says little."""
     most_effects: int = 3
     """Most effects that a search adds, a bound on its time: the recordings it was tested on have two, and it may add one that it drops again."""
     little_db: float = 2.0

@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from edgefilter.diagnosis.ordinary import p_value
-from edgefilter.diagnosis.recording import Recording, share_of
 from edgefilter.diagnosis.result import Finding, Interval
+from edgefilter.diagnosis.straightened import Straightened, share_of
 from edgefilter.diagnosis.trials import Found, Trial, less
 from edgefilter.echo.effect import vanishes
 from edgefilter.echo.effects.catalogue import find
@@ -73,7 +73,7 @@ def evidence_of(name: str, values: Values, start: EchoModel, otherwise: str) -> 
     return said + (HELD if held else "")
 
 
-def _intervals(recording: Recording, model: EchoModel, step: Trial) -> tuple[Mapping[str, Interval], list[str]]:
+def _intervals(recording: Straightened, model: EchoModel, step: Trial) -> tuple[Mapping[str, Interval], list[str]]:
     """Each scalar parameter, or short list, with the interval from fits to a third of the recording each; which failed.
 
     Where fewer than two thirds can be fitted, a parameter may have any of its possible values.

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from edgefilter.diagnosis.criteria import Criteria
-from edgefilter.diagnosis.recording import Recording
 from edgefilter.diagnosis.select import refit, standing
+from edgefilter.diagnosis.straightened import Straightened
 from edgefilter.diagnosis.trials import Workbench
 from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.echo.measurement import Measurement
@@ -35,7 +35,7 @@ def fit_jointly(measurement: Measurement, model: EchoModel, wanted: Sequence[str
     return best
 
 
-def fit_straight(prepared: Recording, wanted: Sequence[str]) -> tuple[EchoModel, tuple[str, ...]]:
+def fit_straight(prepared: Straightened, wanted: Sequence[str]) -> tuple[EchoModel, tuple[str, ...]]:
     """The prepared recording's model with those effects, fitted jointly, and with what the running filter follows.
 
     The names of the latter are the second answer: a drift or a turned volume of this recording would spoil the fit of the

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edgefilter.diagnosis.recording import bands
+from edgefilter.diagnosis.straightened import bands
 from edgefilter.diagnosis.trials import Found
 from edgefilter.dsp.frames import block_power, blocks, decibels
 from edgefilter.dsp.tones import tones

@@ -14,7 +14,7 @@ from edgefilter.calibration.from_recording import fan_in_silences, find_drift, s
 from edgefilter.calibration.multisine import PERIOD
 from edgefilter.diagnosis.compare import rounded
 from edgefilter.diagnosis.prepare import leads
-from edgefilter.diagnosis.recording import FRAME, HOP
+from edgefilter.diagnosis.straightened import FRAME, HOP
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.fractional_delay import delayed, interpolate
 from edgefilter.dsp.frames import block_power, decibels, frames

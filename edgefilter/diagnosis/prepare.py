@@ -1,4 +1,4 @@
-"""Bring a recording of the robot alone into a state in which a prediction can be held against it: rate, lag, silence."""
+"""Bring a recording of the robot alone into a state in which a prediction can be held against it: lag, silence."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 from edgefilter.alignment.belief import LEADS, Belief, believe, find_lag
 from edgefilter.calibration.from_recording import TAIL_S
-from edgefilter.diagnosis.recording import FRAME, Recording
+from edgefilter.diagnosis.straightened import FRAME, Straightened
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.dsp.frames import all_block_power, blocks, decibels
 from edgefilter.dsp.lag import correlation_near, highest, likely_cross, top
 from edgefilter.dsp.psd import floored, hann
-from edgefilter.dsp.resample import at_16_khz
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.lag_track import track_lag
 from edgefilter.echo.measurement import STEADY_DB, Measurement, whiten
@@ -43,13 +42,13 @@ PAUSE_S, LAG_STEP = 0.5, 480
 then: less is left for the effects to explain."""
 
 
-def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_rate: int = SAMPLE_RATE) -> Recording:
-    """Resample to 16 kHz, find the constant lag, mark the robot's silence and the blocks that fits may use.
+def prepare(profile: Profile, recording: Samples, reference: Samples) -> Straightened:
+    """Find the constant lag, mark the robot's silence and the blocks that fits may use.
 
-    recording (m,), reference (k,): float, full scale +-1, at sample_rate. Raises SignalError for less than a second or
+    recording (m,), reference (k,): float, full scale +-1, at 16 kHz. Raises SignalError for less than a second or
     where the recording does not contain the reference.
     """
-    y, x = paired(at_16_khz(recording, sample_rate), at_16_khz(reference, sample_rate))
+    y, x = paired(recording, reference)
     n, start = y.size, profile.delay - PRE_ROLL
     model = profile.echo.during(Measurement(x, y))
     predicted = model.predict(delayed(x, start))
@@ -91,7 +90,7 @@ def prepare(profile: Profile, recording: Samples, reference: Samples, *, sample_
         warnings += (f"the utterances lag by different numbers of samples: {lags}; aligned one by one",)
     measurement = Measurement(x, y, psd, fitted_blocks(n) & usable, calibrated)
     ordinary = ordinary_distortion(profile, predicted)
-    return Recording(measurement, model, predicted, usable, active, offset, human, warnings, ordinary)
+    return Straightened(measurement, model, predicted, usable, active, offset, human, warnings, ordinary)
 
 
 def leads(lag: float) -> str:

@@ -15,7 +15,7 @@ from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import holds
 from edgefilter.diagnosis.joint import fit_jointly
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.recording import HOP, STEP, Recording, Score, bands
+from edgefilter.diagnosis.straightened import HOP, STEP, Score, Straightened, bands
 from edgefilter.diagnosis.trials import Found
 from edgefilter.dsp.convolution import convolve
 from edgefilter.dsp.fractional_delay import delayed
@@ -133,7 +133,7 @@ class Heard:
     Each with the explanations as fitted to the first recording and to that half.
     """
 
-    halves: tuple[tuple[Recording, list[Explanation]], ...]
+    halves: tuple[tuple[Straightened, list[Explanation]], ...]
 
     @cached_property
     def evidence(self) -> Array:
@@ -142,19 +142,18 @@ class Heard:
 
 
 class Inquiry:
-    """A recording (m,) of a reference (n,) and its explanations, each fitted to one half of it: what can be asked.
+    """A prepared recording of a reference (n,) and its explanations, each fitted to one half of it: what can be asked.
 
-    wanted: the effects of each explanation; two that predict the same are one. Raises SignalError where the recording
-    does not contain the reference or a fit fails, UsageError for an event.
+    wanted: the effects of each explanation; two that predict the same are one. Raises SignalError where a fit fails,
+    UsageError for an event.
     """
 
     def __init__(
-        self, profile: Profile, wanted: Sequence[tuple[str, ...]], recording: Samples, reference: Samples
+        self, profile: Profile, prepared: Straightened, wanted: Sequence[tuple[str, ...]], reference: Samples
     ) -> None:
         for name in (name for effects in wanted for name in effects if find(name).event):
             raise UsageError(f"{name} belongs to one recording, and no other can tell of it: ask without it")
-        self.profile, self.reference = profile, reference
-        self._first = prepare(profile, recording, reference)
+        self.profile, self.reference, self._first = profile, reference, prepared
         measurement = self._first.measurement
         kept: list[Explanation] = []
         voices: list[Samples] = []
@@ -185,7 +184,7 @@ class Inquiry:
             tuple((half, [self._again(one, half.model, first, half) for one in self.explanations]) for half in halves)
         )
 
-    def _again(self, one: Explanation, start: EchoModel, *parts: Recording) -> Explanation:
+    def _again(self, one: Explanation, start: EchoModel, *parts: Straightened) -> Explanation:
         """The same fitted to the first recording and others, as one.
 
         What a clock does begins anew with each recording, so that a model of one stays as it is.
@@ -371,7 +370,7 @@ def _fitted(measurement: Measurement, model: EchoModel, effects: Sequence[str]) 
         raise SignalError(f"{'+'.join(effects)} cannot be fitted to the recording: {error}") from None
 
 
-def _halves(prepared: Recording) -> tuple[Recording, Recording]:
+def _halves(prepared: Straightened) -> tuple[Straightened, Straightened]:
     """The same with one half to fit to and the other to test on, and the other way round."""
     return prepared, prepared.fitted_to(prepared.held_out)
 
@@ -394,7 +393,7 @@ def _simulated(profile: Profile, true: Explanation, sound: Samples) -> Samples:
     return heard.astype(np.float32)
 
 
-def _found(prepared: Recording, model: EchoModel) -> Found:
+def _found(prepared: Straightened, model: EchoModel) -> Found:
     """What a model leaves of a recording, as a search says it that ends with that model."""
     start = prepared.model
     return Found(prepared, start, model, prepared.of(start), prepared.of(model), ())
@@ -419,20 +418,19 @@ def _as_one(found: Sequence[Found]) -> Found:
             excess_db=power("excess_db"),
             active_db=power("active_db"),
             silent_db=power("silent_db"),
-            fitted_db=power("fitted_db"),
         )
 
     return replace(found[0], base=joined([one.base for one in found]), final=joined([one.final for one in found]))
 
 
-def _cells(recording: Recording, model: EchoModel) -> tuple[Array, Array, Array]:
+def _cells(recording: Straightened, model: EchoModel) -> tuple[Array, Array, Array]:
     """The power that a model leaves, what it expects, and its voice, over the known fan, (moments, bands) each."""
     score = recording.of(model)
     power = recording.cells(recording.measurement.recording - score.prediction)
     return power, power / score.cells, recording.cells(score.prediction)
 
 
-def _log_likelihood(prepared: Recording, explanations: Sequence[Explanation]) -> Array:
+def _log_likelihood(prepared: Straightened, explanations: Sequence[Explanation]) -> Array:
     """Log likelihood of the cells that no fit has used, (moments, explanations + 1), the last of none of them.
 
     Student's t with as many degrees of freedom as the cell has (Lange, Little & Taylor 1989): what is louder than

@@ -13,9 +13,8 @@ from edgefilter.calibration.from_recording import self_calibrate
 from edgefilter.diagnosis.compare import rounded
 from edgefilter.diagnosis.joint import fit_straight
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.recording import Recording
+from edgefilter.diagnosis.straightened import Straightened
 from edgefilter.dsp.frames import block_power, decibels
-from edgefilter.dsp.resample import at_16_khz
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.recording import BLOCK
@@ -70,13 +69,12 @@ class Proof:
 class HeldOut:
     """A recording (n,) cut in two at a pause: a part to fit to, and the robot alone of the rest, for a filter that begins.
 
-    profile: as of `prove`. seconds: of the robot alone in that rest. Raises SignalError where either part holds less than
-    LEAST_S of the robot.
+    profile: as of Recording; prepared: with it, or with one made from the recording. seconds: of the robot alone in that
+    rest. Raises SignalError where either part holds less than LEAST_S of the robot.
     """
 
-    def __init__(self, profile: Profile | None, recording: Samples, reference: Samples) -> None:
-        self._profile = profile
-        self._prepared = prepared = prepare(profile or self_calibrate(recording, reference), recording, reference)
+    def __init__(self, profile: Profile | None, prepared: Straightened, recording: Samples, reference: Samples) -> None:
+        self._profile, self._prepared = profile, prepared
         robot = prepared.usable & prepared.active
         self.cut = _cut(prepared.prediction, robot)
         self._tested = robot[self.cut :]
@@ -93,11 +91,22 @@ class HeldOut:
         self._early = replace(early.fitted_to(early.fit & before), usable=early.usable & before)
 
     def proof(self, names: Sequence[str]) -> Proof:
-        """The proof of effects, fitted to the first part."""
+        """The proof of effects, fitted to the first part as Recording.add does it.
+
+        A filter that begins with the rest, engine "linear", runs over it with the profile before and after. Where somebody
+        else talks is left out.
+        """
         proof = Proof(tuple(names), self.cut / SAMPLE_RATE, self.seconds, self._erle_before_db, self._erle_with(names))
         if not proof.worse or len(names) < 2:
             return proof
         return replace(proof, without=tuple((name, self._erle_with([n for n in names if n != name])) for name in names))
+
+    def until_kept(self, names: Sequence[str]) -> tuple[Proof, ...]:
+        """The proof of all names, then without the one that does most harm, while there is one: the last names what is kept."""
+        proofs = [self.proof(names)]
+        while proofs[-1].worse and (culprit := proofs[-1].culprit):
+            proofs.append(self.proof([name for name in proofs[-1].effects if name != culprit]))
+        return tuple(proofs)
 
     @cached_property
     def _erle_before_db(self) -> float:
@@ -116,73 +125,6 @@ class HeldOut:
         return float(before - after)
 
 
-def prove(
-    profile: Profile | None,
-    names: str | Sequence[str],
-    recording: Samples,
-    reference: Samples,
-    *,
-    sample_rate: int = SAMPLE_RATE,
-) -> Proof:
-    """Say whether the running filter is better with effects than without them, on seconds that their fit has not seen.
-
-    Parameters
-    ----------
-    profile : Profile or None
-        What is known of the robot. None: the filter without a profile is held against one with a profile made from the
-        recording and the effects.
-    names : str or sequence of str
-        Of the effects; of none only where there is no profile.
-    recording, reference, sample_rate
-        As of `diagnose`.
-
-    Returns
-    -------
-    Proof
-        ERLE before and after.
-
-    Raises
-    ------
-    UsageError
-        For an unknown effect.
-    SignalError
-        Where the recording does not contain the reference, or too little of it to hold seconds out.
-
-    Notes
-    -----
-    The effects are fitted, as `add` does it, to the first three fifths of the robot's voice. A filter that begins with
-    the rest, engine "linear", then runs over it with the profile before and after. Where somebody else talks is left
-    out.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from edgefilter import calibrate, generate_sweep
-    >>> rng, sweep = np.random.default_rng(0), generate_sweep()
-    >>> fan = lambda n: 1e-3 * rng.standard_normal(n).astype(np.float32)
-    >>> profile = calibrate(sweep, 0.5 * np.roll(sweep, 300) + fan(sweep.size), fan(64_000))
-    >>> said = (0.2 * rng.standard_normal(80_000) * np.repeat(rng.uniform(size=25) > 0.3, 3200)).astype(np.float32)
-    >>> heard = 0.5 * np.roll(said, 300) + 0.2 * np.roll(said, 900) + fan(said.size)
-    >>> proof = prove(profile, "late_reverb", heard, said)
-    >>> proof.worse, proof.erle_after_db > proof.erle_before_db + 3
-    (False, True)
-    """
-    held = HeldOut(profile, at_16_khz(recording, sample_rate), at_16_khz(reference, sample_rate))
-    return held.proof(listed(names))
-
-
-def proofs_until_kept(
-    profile: Profile | None, names: str | Sequence[str], recording: Samples, reference: Samples
-) -> tuple[Proof, ...]:
-    """`prove` of all names, then without the one that does most harm, while there is one: the last names what is kept."""
-    held = HeldOut(profile, recording, reference)
-    proofs = [held.proof(listed(names))]
-    while proofs[-1].worse and (culprit := proofs[-1].culprit):
-        kept = tuple(name for name in proofs[-1].effects if name != culprit)
-        proofs.append(held.proof(kept))
-    return tuple(proofs)
-
-
 def listed(names: str | Sequence[str]) -> tuple[str, ...]:
     """The names, each once, of one or several effects."""
     return (names,) if isinstance(names, str) else tuple(dict.fromkeys(names))
@@ -194,7 +136,7 @@ def lasts(name: str) -> bool:
 
 
 def with_fitted(
-    profile: Profile, prepared: Recording, names: Sequence[str]
+    profile: Profile, prepared: Straightened, names: Sequence[str]
 ) -> tuple[Profile, EchoModel, tuple[str, ...]]:
     """The profile with those effects fitted; the fitted model and the names of what was straightened in it."""
     model, straightened = fit_straight(prepared, names) if names else (prepared.model, ())

@@ -1,286 +1,412 @@
-"""A recording of the robot alone, straightened, and how well a model explains it on the samples that no fit has used."""
+"""A recording of the robot alone, straightened once: compare it with a profile, diagnose it, add effects, prove them, ask."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
-from typing import NamedTuple, cast
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
+from functools import cached_property
 
-import numpy as np
-from numpy.typing import NDArray
-from scipy import fft
-from scipy.ndimage import uniform_filter1d
+from edgefilter.calibration.from_recording import self_calibrate
+from edgefilter.diagnosis.compare import Comparison, describe
+from edgefilter.diagnosis.criteria import Criteria
+from edgefilter.diagnosis.diagnose import as_written, conclude
+from edgefilter.diagnosis.joint import fit_jointly
+from edgefilter.diagnosis.prepare import prepare
+from edgefilter.diagnosis.probe import Inquiry
+from edgefilter.diagnosis.proof import HeldOut, Proof, lasts, listed, with_fitted
+from edgefilter.diagnosis.result import Candidate, Diagnosis
+from edgefilter.diagnosis.select import search
+from edgefilter.diagnosis.straightened import Straightened
+from edgefilter.dsp.resample import at_16_khz
+from edgefilter.echo.effects.catalogue import find
+from edgefilter.errors import SignalError
+from edgefilter.profile.data import Profile
+from edgefilter.types import SAMPLE_RATE, Samples
 
-from edgefilter.dsp import fourier
-from edgefilter.dsp.frames import decibels, frames
-from edgefilter.dsp.psd import GRID_BINS, ROUNDING_PSD, coloured, floored, frequencies, hann, variance_at
-from edgefilter.dsp.stft import StftConfig
-from edgefilter.echo.least_squares import normal_equations
-from edgefilter.echo.measurement import Measurement
-from edgefilter.echo.model import EchoModel
-from edgefilter.echo.recording import BLOCK
-from edgefilter.echo.wiener import convolve_from
-from edgefilter.types import Array, Samples
-
-FRAME, HOP = StftConfig.n_fft, StftConfig.hop
-"""Samples of the frames that a prediction is judged in, those of the running filter."""
-FRAMES_PER_CELL = 8
-STEP = HOP * FRAMES_PER_CELL
-"""Samples from one cell to the next."""
-SPAN = STEP - HOP + FRAME
-"""Samples of one cell."""
-FEWEST = round(BLOCK / STEP)
-"""Least number of cells without the robot, half a second, from which the level of its silences is read."""
-TOLERANCE = 0.012
-"""An ordinary robot's path differs from its calibration by this share at each frequency (0.1 dB, 0.7 degrees)."""
-TOLERANCE_TAPS = 32
-"""Of the filter, 2 ms, its middle at 0, that takes up so much."""
+PROMISE_DB = 0.5
+"""What is written may leave so much more than the diagnosis did, as it says, before it is asked why: intervals are as wide."""
 
 
-@dataclass(frozen=True, eq=False)
-class Score:
-    """Of one prediction.
-
-    level_db: negative log likelihood of the residual's cells of time and frequency, in dB for each degree of freedom:
-    Student's t of as many degrees as a cell has (Lange, Little & Taylor 1989, "Robust statistical modeling using the t
-    distribution"), around the noise that the model expects. Far over that it is the mean of the cells' dB: many cells
-    count, not the loudest. Noise that a model expects on top of the ordinary costs half of its dB: else anything could
-    be called noise. over_db: the same without that cost. floor_db: that of the cells in which the robot is silent, 0 where it
-    never is: what is left at best.
-    excess_db: mean power of the held-out whitened residual, dB. active_db, silent_db: while the robot is heard, and is
-    not. fitted_db: of the samples to fit on, while it is heard. Noise that a model expects counts as fan in these;
-    irreducible_db: the excess over the fan alone then, else 0.
-    cells: (times, bands) power over the fan. prediction: (n,) with the ordinary tolerances taken up.
-    """
-
-    level_db: float
-    over_db: float
-    floor_db: float
-    excess_db: float
-    active_db: float
-    silent_db: float
-    fitted_db: float
-    irreducible_db: float
-    cells: Array = field(repr=False)
-    prediction: Samples = field(repr=False)
-
-
-class Bands(NamedTuple):
-    """Of a cell: bins at which bands begin, (bands + 1,), their edges in Hz, (bands, 2), their degrees of freedom, (bands,)."""
-
-    bins: NDArray[np.integer]
-    hz: Array
-    freedom: Array
-
-
-@cache
-def bands() -> Bands:
-    """The bands in which residuals are judged, a third of an octave and less each."""
-    bins = np.unique(np.concatenate(([2], np.round(np.geomspace(4, FRAME // 2 - 6, 26)).astype(int))))
-    hz = frequencies(FRAME // 2 + 1)[bins]
-    return Bands(bins, np.stack((hz[:-1], hz[1:]), axis=1), np.diff(bins).astype(float))
-
-
-@dataclass(frozen=True, eq=False)
 class Recording:
-    """A recording beside what the profile predicts, on one sample counter; all arrays (n,).
+    """A recording of the robot alone and what it said, beside what a profile predicts of it.
 
-    measurement: aligned reference, recording, the fan's PSD, the samples to fit on. model: the profile's, less the
-    events of other recordings. prediction: of that model. usable: samples where nobody else talks. active: where the
-    robot is heard. offset: samples of lag against the calibration. human: (start_s, end_s) of other talkers. ordinary:
-    the robot's own distortion, as calibrated, in the form of EchoModel.unpredictable.
+    It is straightened when it is first asked something, and once: a constant lag of up to 3 s is taken out, and what others
+    say is marked. `mic`, `reference`: at 16 kHz. `profile`: the one given (`known`), or one made from the recording.
 
-    of() scores models. In the cells of time and frequency that no fit has seen the residual is held to be Gaussian
-    (Whittle 1953), with the variance that the model expects times an unknown factor, since every model errs: Student's t.
-    So what counts is that the residual sinks in many cells, not that one loud passage does.
+    Parameters
+    ----------
+    mic : ndarray of float, shape (m,)
+        The robot alone at its microphone, from some seconds up, full scale +-1.
+    reference : ndarray of float, shape (n,)
+        What it said, as sent to the loudspeaker.
+    profile : Profile, optional
+        What is known of the robot. None: a provisional profile is made from the recording.
+    sample_rate : int
+        Of both; they are converted to 16 kHz.
+
+    Raises
+    ------
+    SignalError
+        Where the samples are unusable; by every method, where the recording does not contain the reference.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from edgefilter import Recording, calibrate, generate_sweep
+    >>> rng, sweep = np.random.default_rng(0), generate_sweep()
+    >>> fan = lambda n: 1e-3 * rng.standard_normal(n).astype(np.float32)
+    >>> profile = calibrate(sweep, 0.5 * np.roll(sweep, 300) + fan(sweep.size), fan(64_000))
+    >>> said = (0.2 * rng.standard_normal(80_000) * np.repeat(rng.uniform(size=25) > 0.3, 3200)).astype(np.float32)
+    >>> recording = Recording(0.4 * np.roll(said, 300) + fan(said.size), said, profile)  # 1.9 dB softer than it was
+    >>> found = recording.diagnose()
+    >>> found.verdict, found.ranking[0].effect, round(found.ranking[0].parameters["gain_db"].value, 1)
+    ('missing', 'playback_gain', -1.9)
+    >>> recording.prove("playback_gain").worse
+    False
     """
 
-    measurement: Measurement
-    model: EchoModel
-    prediction: Samples
-    usable: NDArray[np.bool_]
-    active: NDArray[np.bool_]
-    offset: float
-    human: tuple[tuple[float, float], ...] = ()
-    warnings: tuple[str, ...] = ()
-    ordinary: tuple[tuple[Samples, Array], ...] = ()
-    _behind: dict[bytes, Recording] = field(default_factory=dict, init=False, repr=False)
-
-    @property
-    def held_out(self) -> NDArray[np.bool_]:
-        """Samples that no fit has used, (n,)."""
-        return self.usable & ~self.fit
-
-    @property
-    def fit(self) -> NDArray[np.bool_]:
-        """The samples to fit on, which prepare() always marks, (n,)."""
-        return cast("NDArray[np.bool_]", self.measurement.fit)
-
-    @property
-    def noise_psd(self) -> Samples:
-        """The fan's PSD, which prepare() always knows, (601,)."""
-        return cast(Samples, self.measurement.noise_psd)
-
-    def fitted_to(self, fit: NDArray[np.bool_]) -> Recording:
-        """The same with other samples to fit on, (n,)."""
-        return replace(self, measurement=replace(self.measurement, fit=fit))
-
-    def behind(self, model: EchoModel) -> Recording:
-        """The same with the fan that a model expects; itself where that is the profile's."""
-        was, now = (each.expected_noise(self.noise_psd) for each in (self.model, model))
-        if np.array_equal(was, now):
-            return self
-        psd = floored(self.noise_psd * (now / was)).astype(np.float32)
-        if (key := psd.tobytes()) not in self._behind:
-            self._behind[key] = replace(self, measurement=replace(self.measurement, noise_psd=psd), model=model)
-        return self._behind[key]
+    def __init__(
+        self, mic: Samples, reference: Samples, profile: Profile | None = None, *, sample_rate: int = SAMPLE_RATE
+    ) -> None:
+        self.mic, self.reference = at_16_khz(mic, sample_rate), at_16_khz(reference, sample_rate)
+        self.profile, self.known = profile or self_calibrate(self.mic, self.reference), profile is not None
 
     @cached_property
-    def starts(self) -> NDArray[np.signedinteger]:
-        """First sample of each held-out cell, (times,)."""
-        starts = np.arange(0, self.usable.size - SPAN + 1, STEP)
-        return starts[_within(self.held_out, starts) >= 0.9 * SPAN]
+    def straightened(self) -> Straightened:
+        """On the sample counter of the prediction, with the samples to fit and those to test on."""
+        return prepare(self.profile, self.mic, self.reference)
 
     @cached_property
-    def active_cells(self) -> NDArray[np.bool_]:
-        """Those in which the robot is heard, (times,)."""
-        return _within(self.active, self.starts) > 0.3 * SPAN
+    def held_out(self) -> HeldOut:
+        """Cut in two, for a proof. Raises SignalError where it is too short for that."""
+        return HeldOut(self.profile if self.known else None, self.straightened, self.mic, self.reference)
 
-    @property
-    def silent_cells(self) -> NDArray[np.bool_]:
-        """Those in which it is not, (times,): none where they are too few to tell."""
-        silent = ~self.active_cells
-        return silent & (np.count_nonzero(silent) >= FEWEST)
+    def compare(self) -> Comparison:
+        """Say how far the profile's prediction is from the recording, and where: `compare`."""
+        return describe(self.straightened, self.straightened.model)
 
-    def cells(self, residual: Samples) -> Array:
-        """Power of the residual (n,) over the fan's, in the held-out cells, (times, bands)."""
-        at = self.starts[:, None] + np.arange(FRAMES_PER_CELL) * HOP
-        read = frames(residual, FRAME, 1)[at] * _window()
-        return _by_band(fourier.power(fft.rfft(read, axis=-1)).mean(axis=1) / self._fan_bins)
+    def diagnose(
+        self,
+        *,
+        progress: Callable[[str], None] | None = None,
+        criteria: Criteria | None = None,
+        without: Collection[str] = (),
+    ) -> Diagnosis:
+        """Find out which physical effects the profile lacks: `diagnose`."""
+        criteria, prepared = criteria or Criteria(), self.straightened
+        found = search(prepared, prepared.model, criteria, progress, without)
+        return conclude(prepared, found, criteria, progress, without)
 
-    def of(self, model: EchoModel) -> Score:
-        """The score of what a model predicts, in the noise that it expects.
+    def diagnose_proven(
+        self, *, progress: Callable[[str], None] | None = None, criteria: Criteria | None = None
+    ) -> Diagnosis:
+        """Diagnose the first part, without the effects that the running filter contradicts on the rest.
 
-        That is the fan, as what is at the microphone lets it through, and what no waveform predicts. The ordinary
-        tolerances are taken up first. A gain of the microphone, which the fan passed as well, is taken out of the residual
-        before that is held against the fan. The cells keep it: as a likelihood their level has to be that of the recording
-        as it is.
+        Parameters
+        ----------
+        progress, criteria
+            As of `diagnose`.
+
+        Returns
+        -------
+        Diagnosis
+            With the proof of all lasting effects on the voice together, or why there is none.
+
+        Notes
+        -----
+        The first three fifths of the robot's voice are diagnosed, the running filter then takes the rest (`prove`). Where
+        it is worse, the diagnosis is made anew without the effect that does most harm: another one may take its place. Not
+        proven are events, which do not come again, and changes of the stationary noise. Where a recording is too short to
+        be cut, all of it is diagnosed and nothing proven.
         """
-        here = self.behind(model)
-        measurement, reference = here.measurement, here.measurement.reference
-        corrected = here.correct(*measurement.predicted(model))
-        unpredictable = model.unpredictable(reference)
-        passed, gain = model.passed(here._fan, reference), model.microphone_gain(self.usable.size)
-        residual = measurement.recording - corrected
-        expected = (*unpredictable, *self.ordinary)
-        variance = here._expected_cells(expected)
-        plain = measurement.whiten(residual / gain).astype(np.float64) ** 2
-        power = here._over_expected(plain, expected) if expected else plain
-        if passed is not here._fan:
-            variance = variance * (here.cells(passed + here._rounding) / here._fan_cells)
-        cells = here.cells(residual) / variance
-        levels = decibels(0.5 + 0.5 * cells)
-        over_db = _mean(levels)
-        louder = _by_band(here._fan_bins / self._fan_bins)
-        cost_db = _mean(0.5 * decibels(variance * louder / self._ordinary_cells))
-        held, active = self.held_out, self.active
-        return Score(
-            level_db=over_db + cost_db,
-            over_db=over_db,
-            floor_db=_mean(levels[self.silent_cells]),
-            excess_db=_db(power[held]),
-            active_db=_db(power[held & active]),
-            silent_db=_db(power[held & ~active]),
-            fitted_db=_db(power[self.fit & active]),
-            irreducible_db=_db(plain[held]) if unpredictable else 0.0,
-            cells=cells,
-            prediction=corrected,
-        )
+        disproved: dict[str, Proof] = {}
+        early, too_short = self, ""
+        try:
+            stop = self.held_out.cut
+            early = Recording(self.mic[:stop], self.reference[:stop], self.profile)
+        except SignalError as error:
+            too_short = str(error)
+        while True:
+            found = early.diagnose(progress=progress, criteria=criteria, without=disproved)
+            names = tuple(finding.effect for finding in found.ranking if lasts(finding.effect))
+            if too_short or not names:
+                return _told(found, disproved, unproven=too_short if names else "nothing lasting was found")
+            if progress:
+                progress("the running filter without and with what was found")
+            proof = self.held_out.proof(names)
+            if not proof.worse:
+                return _told(found, disproved, proof)
+            disproved[proof.culprit or names[0]] = proof
 
-    def silences_db(self, score: Score) -> float:
-        """By how much the robot's silences, or all where it is never silent, are louder than expected, dB."""
-        power = _mean(score.cells[self.silent_cells] if self.silent_cells.any() else score.cells)
-        return float(decibels(power)) if power > 0.0 else 0.0
+    def add(self, names: str | Sequence[str]) -> tuple[Profile, Comparison, Comparison]:
+        """Fit effects, beside each other, and write them into a new profile: `add`."""
+        prepared = self.straightened
+        knowing, model, straightened = with_fitted(self.profile, prepared, listed(names))
+        before, after = self.compare(), Recording(self.mic, self.reference, knowing).compare()
+        if not straightened:
+            return knowing, before, after
+        values, straight = dict(model.effects), prepared.model
+        for name in straightened:
+            straight = straight.with_effect(name, values[name])
+        told = tuple(f"{name} is taken out first: {find(name).sentence(values[name])}" for name in straightened)
+        left = f"{before.excess_db:.1f} dB over the noise floor before, {after.excess_db:.1f} dB after"
+        told += (f"with that left in, as compare has it: {left}",)
+        told_of = replace(prepared, warnings=(*told, *prepared.warnings))
+        return knowing, describe(told_of, straight), describe(told_of, model)
 
-    def correct(self, prediction: Samples, white: Samples) -> Samples:
-        """A prediction, also given whitened, through the filter, within TOLERANCE of 1, that brings it closest to the recording."""
-        target, lead = self.measurement.white_recording - white, TOLERANCE_TAPS // 2
-        rows = self.fit & self.usable & self.active & (np.arange(self.usable.size) % 3 == 0)
-        weights, _ = normal_equations([white], target, TOLERANCE_TAPS, lead, rows).solve(1e-5)
-        response = np.fft.rfft(weights[0], 256)
-        bounded = np.fft.irfft(response * np.minimum(1.0, TOLERANCE / np.maximum(np.abs(response), 1e-12)), 256)
-        return prediction + convolve_from(prediction, np.roll(bounded, 96), 96 + lead)
+    def settle(self, found: Diagnosis, names: Sequence[str]) -> tuple[Profile, Comparison, Diagnosis]:
+        """Write findings of a diagnosis into a new profile.
 
-    @cached_property
-    def _fan(self) -> Samples:
-        """A sound like the fan, (n,)."""
-        return coloured(np.random.default_rng(0), self.usable.size, self.noise_psd).astype(np.float32)
+        They are fitted once more, to all of the recording; where that leaves more than PROMISE_DB over what the diagnosis did,
+        its own values are written.
 
-    @cached_property
-    def _rounding(self) -> Samples:
-        """What the rounding to 16 bit leaves where nothing else is heard, (n,)."""
-        return coloured(np.random.default_rng(1), self.usable.size, np.full(GRID_BINS, ROUNDING_PSD)).astype(np.float32)
+        Parameters
+        ----------
+        found : Diagnosis
+            Of this recording.
+        names : sequence of str
+            Of those of its effects that are written.
 
-    @cached_property
-    def _fan_bins(self) -> Array:
-        """The fan's power in each bin of a frame, (FRAME / 2 + 1,)."""
-        return variance_at(frequencies(FRAME // 2 + 1), self.noise_psd) * float(np.sum(_window() ** 2))
+        Returns
+        -------
+        Profile, Comparison, Diagnosis
+            With the findings; of that profile; with its figures, or as it was where not all of its findings are written.
+        """
+        prepared = self.straightened
+        start, values = prepared.model, dict(found.model.effects)
+        for name in names:
+            start = start.with_effect(name, values[name])
+        everywhere = replace(prepared.measurement, fit=prepared.usable)
+        choices: list[tuple[Comparison, Profile]] = []
+        for model in (fit_jointly(everywhere, start, names), start):
+            echo, values = self.profile.echo, dict(model.effects)
+            for name in names:
+                echo = echo.with_effect(name, values[name])
+            knowing = self.profile.with_echo(echo)
+            choices.append((Recording(self.mic, self.reference, knowing).compare(), knowing))
+            if choices[-1][0].excess_db <= found.remaining_db + PROMISE_DB:
+                break
+        after, knowing = min(choices, key=lambda choice: choice[0].excess_db)
+        if {finding.effect for finding in found.ranking} != set(names):
+            return knowing, after, found
+        return knowing, after, as_written(found, prepared, dict(knowing.echo.effects), after)
 
-    @cached_property
-    def _fan_cells(self) -> Array:
-        """Power of a sound like the fan in the held-out cells, (times, bands)."""
-        return self.cells(self._fan)
+    def prove(self, names: str | Sequence[str]) -> Proof:
+        """Say whether the running filter is better with effects, on seconds that their fit has not seen: `prove`."""
+        return self.held_out.proof(listed(names))
 
-    @cached_property
-    def _ordinary_cells(self) -> Array:
-        """What is expected over the fan where nothing is missing, (times, bands)."""
-        return self._expected_cells(self.ordinary)
+    def probe(self, explanations: Sequence[tuple[str, ...]]) -> Inquiry:
+        """Fit several explanations, to ask which sound would tell them apart.
 
-    def _expected_cells(self, unpredictable: Sequence[tuple[Samples, Array]]) -> Array:
-        """What is expected in the held-out cells, 1 where that is the fan alone, (times, bands)."""
-        expected = np.ones((self.starts.size, bands().freedom.size))
-        for variance, colour in unpredictable:
-            places = np.arange(FRAME // 2 + 1) * (colour.size - 1) / (FRAME // 2)
-            share = np.interp(places, np.arange(colour.size), colour / self.noise_psd)
-            expected = expected + (_within(variance, self.starts) / SPAN)[:, None] * _by_band(share)
-        return expected
+        Parameters
+        ----------
+        explanations : sequence of tuple of str
+            The effects of each; two that predict the same are one.
 
-    def _over_expected(self, power: Array, unpredictable: Sequence[tuple[Samples, Array]]) -> Array:
-        """Power of the whitened residual over what is expected, (n,), smoothed over 16 ms: a knock is known to some ms."""
-        expected = np.ones_like(power)
-        for variance, colour in unpredictable:
-            expected += variance * float(np.mean(colour / self.noise_psd))
-        return uniform_filter1d(power, HOP) / uniform_filter1d(expected, HOP)
+        Returns
+        -------
+        Inquiry
+            `sounds` to play, the best first; `hear` and `answer` judge what was recorded of them; `ask` does all that.
 
-
-def share_of(before_db: float, after_db: float) -> float:
-    """Part of the power over the fan that is gone."""
-    before, after = 10 ** (before_db / 10) - 1.0, 10 ** (after_db / 10) - 1.0
-    return float(np.clip(1.0 - after / before, 0.0, 1.0)) if before > 0.0 else 0.0
-
-
-def _db(power: Array) -> float:
-    return float(decibels(np.mean(power))) if power.size else 0.0
-
-
-@cache
-def _window() -> Samples:
-    return hann(FRAME).astype(np.float32)
+        Raises
+        ------
+        UsageError
+            For an event, which no other recording can tell of.
+        """
+        return Inquiry(self.profile, self.straightened, explanations, self.reference)
 
 
-def _within(x: NDArray[np.generic], starts: NDArray[np.integer]) -> Array:
-    """The sum of x (n,) over the cell from each start on, (starts,)."""
-    total = np.concatenate(([0.0], np.cumsum(x, dtype=np.float64)))
-    return np.asarray(total[starts + SPAN] - total[starts])
+def compare(profile: Profile, recording: Samples, reference: Samples, *, sample_rate: int = SAMPLE_RATE) -> Comparison:
+    """Say how far the profile's prediction of the robot's own voice is from a recording of it, and where.
+
+    Parameters
+    ----------
+    profile, recording, reference, sample_rate
+        As of `Recording`.
+
+    Returns
+    -------
+    Comparison
+        Excess over the noise floor in all, by frequency, time, level and lag.
+
+    Notes
+    -----
+    Excess is the power of recording minus prediction, whitened by the fan's power spectral density, over the fan's
+    own: 0 dB where nothing is left to explain. The ordinary tolerances of path and fan are taken out.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from edgefilter import calibrate, compare, generate_sweep
+    >>> rng, sweep = np.random.default_rng(0), generate_sweep()
+    >>> fan = lambda n: 1e-3 * rng.standard_normal(n).astype(np.float32)
+    >>> profile = calibrate(sweep, 0.5 * np.roll(sweep, 300) + fan(sweep.size), fan(64_000))
+    >>> said = (0.2 * rng.standard_normal(80_000) * np.repeat(rng.uniform(size=25) > 0.3, 3200)).astype(np.float32)
+    >>> compare(profile, 0.4 * np.roll(said, 300) + fan(said.size), said).excess_db > 20
+    True
+    """
+    return Recording(recording, reference, profile, sample_rate=sample_rate).compare()
 
 
-def _mean(cells: Array) -> float:
-    """Mean over cells (times, bands), each by its degrees of freedom; 0 where there is none."""
-    return float(np.average(cells.mean(axis=0), weights=bands().freedom)) if cells.size else 0.0
+def diagnose(
+    profile: Profile,
+    recording: Samples,
+    reference: Samples,
+    *,
+    sample_rate: int = SAMPLE_RATE,
+    progress: Callable[[str], None] | None = None,
+    criteria: Criteria | None = None,
+    without: Collection[str] = (),
+) -> Diagnosis:
+    """Find out which physical effects a profile lacks, from a recording of the robot alone.
+
+    Parameters
+    ----------
+    profile, recording, reference, sample_rate
+        As of `Recording`.
+    progress : callable, optional
+        Called with a short text before each trial.
+    criteria : Criteria, optional
+        When an effect is named.
+    without : collection of str, optional
+        Names of effects that are not tried.
+
+    Returns
+    -------
+    Diagnosis
+        The verdict, and the effects whose presence the data supports, strongest first, with parameters and intervals.
+
+    Notes
+    -----
+    Stepwise selection: every effect is fitted on half of the recording, in blocks of half a second, and tested on the
+    other half (docs/diagnosis_statistics.md).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from edgefilter import calibrate, diagnose, generate_sweep
+    >>> rng, sweep = np.random.default_rng(0), generate_sweep()
+    >>> fan = lambda n: 1e-3 * rng.standard_normal(n).astype(np.float32)
+    >>> profile = calibrate(sweep, 0.5 * np.roll(sweep, 300) + fan(sweep.size), fan(64_000))
+    >>> said = (0.2 * rng.standard_normal(80_000) * np.repeat(rng.uniform(size=25) > 0.3, 3200)).astype(np.float32)
+    >>> diagnose(profile, 0.4 * np.roll(said, 300) + fan(said.size), said).ranking[0].effect
+    'playback_gain'
+    """
+    recorded = Recording(recording, reference, profile, sample_rate=sample_rate)
+    return recorded.diagnose(progress=progress, criteria=criteria, without=without)
 
 
-def _by_band(spectra: Array) -> Array:
-    """Means of spectra (..., FRAME / 2 + 1) over the bins of each band, (..., bands)."""
-    bins, _, freedom = bands()
-    return np.add.reduceat(spectra[..., : bins[-1]], bins[:-1], axis=-1) / freedom
+def add(
+    profile: Profile,
+    names: str | Sequence[str],
+    recording: Samples,
+    reference: Samples,
+    *,
+    sample_rate: int = SAMPLE_RATE,
+) -> tuple[Profile, Comparison, Comparison]:
+    """Fit one or several effects to a recording, beside each other, and write them into a new profile.
+
+    Parameters
+    ----------
+    profile, recording, reference, sample_rate
+        As of `Recording`; the profile stays as it is.
+    names : str or sequence of str
+        Of the effects, as a diagnosis prints them.
+
+    Returns
+    -------
+    Profile
+        With the effects.
+    Comparison, Comparison
+        Before and after, both of the straightened recording; its warnings say what was straightened.
+
+    Raises
+    ------
+    UsageError
+        For an unknown effect.
+
+    Notes
+    -----
+    Clocks that drift, jumps and a turned volume are followed by the running filter itself and would spoil the fit of
+    anything else, so they are taken out of the recording first, unless they are among the names; the profile does not
+    get them. Each effect is fitted with the others in place, in turn, until the error no longer falls, and to all of the
+    recording: that predicts other recordings of the robot better than the fit to half of it by on which `diagnose` tests.
+    So the comparison after is of samples that the fit has used; `prove` says what the effects are worth on others. An event
+    (a jump, a moment's move) is kept with the recording in which it happened: of any other the profile predicts what it
+    did before.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from edgefilter import add, calibrate, generate_sweep
+    >>> rng, sweep = np.random.default_rng(0), generate_sweep()
+    >>> fan = lambda n: 1e-3 * rng.standard_normal(n).astype(np.float32)
+    >>> profile = calibrate(sweep, 0.5 * np.roll(sweep, 300) + fan(sweep.size), fan(64_000))
+    >>> said = (0.2 * rng.standard_normal(80_000) * np.repeat(rng.uniform(size=25) > 0.3, 3200)).astype(np.float32)
+    >>> better, before, after = add(profile, "playback_gain", 0.4 * np.roll(said, 300) + fan(said.size), said)
+    >>> [name for name, _ in better.echo.effects], after.excess_db < before.excess_db - 6
+    (['playback_gain'], True)
+    """
+    return Recording(recording, reference, profile, sample_rate=sample_rate).add(names)
+
+
+def prove(
+    profile: Profile | None,
+    names: str | Sequence[str],
+    recording: Samples,
+    reference: Samples,
+    *,
+    sample_rate: int = SAMPLE_RATE,
+) -> Proof:
+    """Say whether the running filter is better with effects than without them, on seconds that their fit has not seen.
+
+    Parameters
+    ----------
+    profile, recording, reference, sample_rate
+        As of `Recording`.
+    names : str or sequence of str
+        Of the effects; of none only where no profile was given: then the filter without a profile is held against
+        one with a profile made from the recording and the effects.
+
+    Returns
+    -------
+    Proof
+        ERLE before and after.
+
+    Raises
+    ------
+    UsageError
+        For an unknown effect.
+    SignalError
+        Also where there is too little of the robot to hold seconds out.
+
+    Notes
+    -----
+    The effects are fitted, as `add` does it, to the first three fifths of the robot's voice. A filter that begins with
+    the rest, engine "linear", then runs over it with the profile before and after. Where somebody else talks is left
+    out.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from edgefilter import calibrate, generate_sweep, prove
+    >>> rng, sweep = np.random.default_rng(0), generate_sweep()
+    >>> fan = lambda n: 1e-3 * rng.standard_normal(n).astype(np.float32)
+    >>> profile = calibrate(sweep, 0.5 * np.roll(sweep, 300) + fan(sweep.size), fan(64_000))
+    >>> said = (0.2 * rng.standard_normal(80_000) * np.repeat(rng.uniform(size=25) > 0.3, 3200)).astype(np.float32)
+    >>> heard = 0.5 * np.roll(said, 300) + 0.2 * np.roll(said, 900) + fan(said.size)
+    >>> proof = prove(profile, "late_reverb", heard, said)
+    >>> proof.worse, proof.erle_after_db > proof.erle_before_db + 3
+    (False, True)
+    """
+    return Recording(recording, reference, profile, sample_rate=sample_rate).prove(names)
+
+
+def _told(found: Diagnosis, disproved: dict[str, Proof], proof: Proof | None = None, unproven: str = "") -> Diagnosis:
+    """The diagnosis with its proof and a row for each effect that failed one."""
+    rows = []
+    for name, failed in disproved.items():
+        why = f"with {' and '.join(failed.effects)} the running filter is worse on {failed.seconds:.1f} s that the fit has"
+        why += f" not seen: ERLE {failed.erle_before_db:.1f} dB without, {failed.erle_after_db:.1f} dB with"
+        rows.append(Candidate(name, "failed its proof", why))
+    return replace(found, tried=(*found.tried, *rows), proof=proof, unproven=unproven)

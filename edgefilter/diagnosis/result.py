@@ -52,10 +52,6 @@ class Interval:
         low, high = (np.asarray(value) + end - self.value for end in (self.low, self.high))
         return Interval.of(value, low, high, self.unit)
 
-    def to_dict(self) -> dict[str, object]:
-        """Ready for JSON."""
-        return asdict(self)
-
 
 @dataclass(frozen=True, eq=False)
 class Finding:
@@ -96,10 +92,6 @@ class Candidate:
     numbers: float | None = None
     delta_bic: float | None = None
     rank: int | None = None
-
-    def to_dict(self) -> dict[str, object]:
-        """Ready for JSON."""
-        return dict(rounded(asdict(self)))
 
 
 @dataclass(frozen=True)
@@ -178,7 +170,7 @@ class Diagnosis:
                 "excess_before_db": round(finding.excess_before_db, 3),
                 "excess_after_db": round(finding.excess_after_db, 3),
                 "share": round(finding.share, 4),
-                "parameters": {name: interval.to_dict() for name, interval in finding.parameters.items()},
+                "parameters": {name: asdict(interval) for name, interval in finding.parameters.items()},
                 "evidence": finding.evidence,
                 **({"like": finding.like} if finding.like else {}),
             }
@@ -194,7 +186,7 @@ class Diagnosis:
             "irreducible_db": round(self.irreducible_db, 3),
             "where": {key: compared[key] for key in ("bands", "times", "levels", "lags")},
             **{key: compared[key] for key in ("human", "offset_samples", "warnings")},
-            "tried": [candidate.to_dict() for candidate in self.tried],
+            "tried": [rounded(asdict(candidate)) for candidate in self.tried],
             "independence": {"of_profile": compared["independence"], "of_findings": _dict_of(self.independence)},
             "precision": self.precision.to_dict(),
             "advice": list(self.advice),

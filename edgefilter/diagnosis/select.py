@@ -12,7 +12,7 @@ from itertools import pairwise
 
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.ordinary import p_value
-from edgefilter.diagnosis.recording import Recording
+from edgefilter.diagnosis.straightened import Straightened
 from edgefilter.diagnosis.trials import Found, Trial, Workbench, added, noisy
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
@@ -21,7 +21,7 @@ FULL = "the search ended at {} effects with some error left: something further m
 
 
 def search(
-    recording: Recording,
+    recording: Straightened,
     model: EchoModel,
     criteria: Criteria,
     progress: Callable[[str], None] | None = None,

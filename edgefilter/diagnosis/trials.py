@@ -11,7 +11,7 @@ import numpy as np
 
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.ordinary import p_value
-from edgefilter.diagnosis.recording import Recording, Score
+from edgefilter.diagnosis.straightened import Score, Straightened, share_of
 from edgefilter.echo.effect import vanishes
 from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.echo.measurement import STEADY_DB, Values
@@ -64,7 +64,7 @@ class Found:
     was fitted. like: of a free law the name of its family that it replaces. laws: those that were fitted beside all steps.
     """
 
-    recording: Recording
+    recording: Straightened
     start: EchoModel
     model: EchoModel
     base: Score
@@ -85,7 +85,7 @@ class Found:
         return replace(self, model=model, final=score, steps=tuple(steps))
 
     @cached_property
-    def in_noise(self) -> Recording:
+    def in_noise(self) -> Straightened:
         """The recording with the fan that was found."""
         return self.recording.behind(self.model)
 
@@ -95,7 +95,7 @@ class Workbench:
 
     def __init__(
         self,
-        recording: Recording,
+        recording: Straightened,
         criteria: Criteria,
         progress: Callable[[str], None] | None = None,
         without: Collection[str] = (),
@@ -148,9 +148,9 @@ class Workbench:
 
     def little(self, model: EchoModel) -> bool:
         """Whether a model leaves so little of what the profile leaves that the right effects may be in it."""
-        left, whole = (_over_fan(self.score(each).active_db) for each in (model, self.recording.model))
-        share = left / max(whole, 1e-12)
-        return self.off_db(model) <= self.criteria.little_db and share <= self.criteria.nothing
+        was, left = (self.score(each).active_db for each in (self.recording.model, model))
+        gone = left <= 0.0 or share_of(was, left) >= 1.0 - self.criteria.nothing
+        return gone and self.off_db(model) <= self.criteria.little_db
 
     def left(self, model: EchoModel) -> float:
         """Level in dB over that of the silences, with what noise costs that no waveform predicts."""
@@ -198,16 +198,8 @@ class Workbench:
         return Trial.of(name, model, before, after)
 
     def halves(self, trial: Trial, model: EchoModel) -> bool:
-        """Whether a trial takes away about half of the power over the fan, though the level hardly falls.
-
-        A narrow ring does so, in few cells. Beside a long filter an effect may do so where that filter was fitted and
-        so leaves no more
-        than there is besides: of the held-out samples the filter itself leaves the most.
-        """
-        before, after, most = self.score(model), trial.score, self.criteria.half
-        short = find(trial.name).complexity < self.criteria.long_filter
-        where_fitted = short and _over_fan(after.fitted_db) < most * _over_fan(before.fitted_db)
-        return where_fitted or _over_fan(after.active_db) < most * _over_fan(before.active_db)
+        """Whether a trial takes away half of the power over the fan, though the level hardly falls, as a narrow ring does, in few cells."""
+        return share_of(self.score(model).active_db, trial.score.active_db) > self.criteria.half
 
     def attempt_all(self, model: EchoModel, most: int = 9) -> list[Trial]:
         """Each effect that the model has not and whose complexity is at most `most`.
@@ -304,8 +296,3 @@ def signature(model: EchoModel) -> Signature:
             for name, values in model.effects
         )
     )
-
-
-def _over_fan(level_db: float) -> float:
-    """Power over the fan's, the fan taken off."""
-    return max(10 ** (level_db / 10) - 1.0, 0.0)

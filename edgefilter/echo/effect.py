@@ -72,10 +72,9 @@ class Effect:
 
     What the diagnosis asks:
     title: how it reads inside a sentence ("a turned volume"); by default the name. complexity: of two effects that
-    explain about as much the lower one is named; from 4 on it is a long filter, which half a minute does not teach.
-    flexible: whether it has so many numbers that it takes up what a simpler effect beside it does. free: whether it is the
-    law of a family rather than an effect (free_laws.py): no search tries it. shown_by: recordings in which it differs from
-    effects without them (diagnosis/advice.py).
+    explain about as much the lower one is named. flexible: whether it has so many numbers that it takes up what a simpler
+    effect beside it does. free: whether it is the law of a family rather than an effect (free_laws.py): no search tries it.
+    shown_by: recordings in which it differs from effects without them (diagnosis/advice.py).
     """
 
     name: ClassVar[str]

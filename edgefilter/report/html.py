@@ -16,15 +16,14 @@ import numpy as np
 from edgefilter.audio.files import whole
 from edgefilter.diagnosis.closer_look import CloserLook
 from edgefilter.diagnosis.compare import Comparison, describe
-from edgefilter.diagnosis.diagnose import Diagnosis, Finding
 from edgefilter.diagnosis.laws import Law
 from edgefilter.diagnosis.passport import ENOUGH_DB, Passport
-from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.result import Precision, in_order
+from edgefilter.diagnosis.recording import Recording
+from edgefilter.diagnosis.result import Diagnosis, Finding, Precision, in_order
+from edgefilter.diagnosis.straightened import Straightened
 from edgefilter.diagnosis.trials import less
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import EdgefilterError
-from edgefilter.profile.data import Profile
 from edgefilter.report import passport, text
 from edgefilter.report.media import MAX_SOUND_S, colour_scale, colours, sound, spectrogram_png
 from edgefilter.types import SAMPLE_RATE, Samples
@@ -50,19 +49,17 @@ def comparison_page(found: Comparison, names: Mapping[str, Any]) -> str:
 
 
 def diagnosis_page(
-    profile: Profile,
+    recording: Recording,
     found: Diagnosis,
-    recording: Samples,
-    reference: Samples,
     names: Mapping[str, Any],
     outcome: Sequence[tuple[str, str, str]] = (),
 ) -> str:
     """The page of a diagnosis, with a switch for each found effect.
 
-    recording (n,), reference (m,): what was diagnosed. outcome: further figures at the top, where a profile was written.
+    recording: what was diagnosed. outcome: further figures at the top, where a profile was written.
     """
     steps = in_order(found.ranking)
-    variants = compare_variants(profile, found.model, steps, recording, reference)
+    variants = compare_variants(recording.straightened, found.model, steps)
     if found.written:
         variants[(True,) * len(steps)] = found.written
     fields = {
@@ -309,14 +306,11 @@ def choices(count: int) -> list[Choice]:
     return [tuple(i < on for i in range(count)) for on in range(count + 1)]
 
 
-def compare_variants(
-    profile: Profile, model: EchoModel, findings: Sequence[Finding], recording: Samples, reference: Samples
-) -> dict[Choice, Comparison]:
-    """For each choice of findings, recording (n,) against model, which has them all, without those that are off.
+def compare_variants(prepared: Straightened, model: EchoModel, findings: Sequence[Finding]) -> dict[Choice, Comparison]:
+    """For each choice of findings, a recording against model, which has them all, without those that are off.
 
     The excess of each is the diagnosis's; where it is, is shown for all samples.
     """
-    prepared = prepare(profile, recording, reference)
     found = {}
     for choice in choices(len(findings)):
         partial = model

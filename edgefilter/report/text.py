@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 
 from edgefilter.diagnosis.compare import Comparison
-from edgefilter.diagnosis.diagnose import Diagnosis, Finding, Interval
 from edgefilter.diagnosis.independence import Correlogram, Independence
 from edgefilter.diagnosis.ordinary import percent
 from edgefilter.diagnosis.proof import Proof
-from edgefilter.diagnosis.result import Candidate, Known, Precision, in_order
+from edgefilter.diagnosis.result import Candidate, Diagnosis, Finding, Interval, Known, Precision, in_order
 from edgefilter.echo.effects.catalogue import find, names
 
 UNITS = {"1": "", "1e-6": "ppm"}

@@ -16,7 +16,7 @@ from bench.simulate.simulated_robot import draw_loudspeaker, warp
 from edgefilter import Profile, calibrate, cli, diagnose, enhance, generate_sweep
 from edgefilter.audio.files import FileSink
 from edgefilter.calibration.multisine import BAND_HZ, SPEECH_DB, calibrate_multisine, generate_multisine, multisine_law
-from edgefilter.diagnosis.compare import compare
+from edgefilter.diagnosis.recording import compare
 from edgefilter.dsp.psd import total_power
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.errors import CalibrationError

@@ -10,7 +10,7 @@ import sys
 import pytest
 import soundfile
 
-from edgefilter.diagnosis.compare import compare
+from edgefilter.diagnosis.recording import compare
 from edgefilter.report.html import comparison_page
 from tests.diagnosis.robot_scene import profile, record, voice
 

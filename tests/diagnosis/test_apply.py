@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 
 from edgefilter.calibration.from_recording import self_calibrate
-from edgefilter.diagnosis.compare import compare
-from edgefilter.diagnosis.diagnose import add, diagnose
 from edgefilter.diagnosis.joint import fit_jointly, fit_straight
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.proof import HeldOut, Proof, prove
-from edgefilter.diagnosis.proven import diagnose_proven
+from edgefilter.diagnosis.proof import HeldOut, Proof
+from edgefilter.diagnosis.recording import Recording, add, compare, diagnose, prove
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.measurement import Values
 from edgefilter.echo.model import EchoModel
@@ -79,7 +77,7 @@ def test_reverberation_is_learnt_from_a_recording_whose_clocks_differ(drifting) 
 def test_reverberation_learnt_across_a_drift_helps_the_running_filter(drifting) -> None:
     y, x = drifting
     proof = prove(profile(), "late_reverb", y, x)
-    assert proof.erle_before_db == HeldOut(profile(), y, x).erle_db(profile())
+    assert proof.erle_before_db == Recording(y, x, profile()).held_out.erle_db(profile())
     assert proof.erle_after_db > proof.erle_before_db + 3.0
     assert not proof.worse and proof.seconds > 1.5
 
@@ -168,7 +166,7 @@ def test_the_seconds_of_the_proof_choose_no_name() -> None:
     y = record(x)
     y[100_000:] = record(x, EchoModel(path()).with_effect("playback_gain", {"gain_db": -6.0}))[100_000:]
     assert diagnose(profile(), y, x).ranking
-    found = diagnose_proven(profile(), y, x)
+    found = Recording(y, x, profile()).diagnose_proven()
     assert found.ranking == () and found.comparison.recording.size <= 100_000
     assert found.unproven == "nothing lasting was found"
 
@@ -177,7 +175,7 @@ def test_the_seconds_of_the_proof_choose_no_name() -> None:
 def test_a_name_that_fails_its_proof_is_not_given(monkeypatch) -> None:
     x = voice(6.0)
     y = record(x, EchoModel(path()).with_effect("playback_gain", {"gain_db": -3.0}))
-    found = diagnose_proven(profile(), y, x)
+    found = Recording(y, x, profile()).diagnose_proven()
     assert [finding.effect for finding in found.ranking] == ["playback_gain"]
     assert found.proof is not None and not found.proof.worse
 
@@ -186,7 +184,7 @@ def test_a_name_that_fails_its_proof_is_not_given(monkeypatch) -> None:
         return Proof(names, 3.6, 1.5, 12.0, 12.0 - worse, tuple((name, 12.0) for name in names if len(names) > 1))
 
     monkeypatch.setattr(HeldOut, "proof", contradict)
-    found = diagnose_proven(profile(), y, x)
+    found = Recording(y, x, profile()).diagnose_proven()
     assert "playback_gain" not in [finding.effect for finding in found.ranking]
     (row,) = (row for row in found.tried if row.effect == "playback_gain")
     assert row.verdict == "failed its proof" and "ERLE 12.0 dB without, 8.0 dB with" in row.why
@@ -196,7 +194,7 @@ def test_a_name_that_fails_its_proof_is_not_given(monkeypatch) -> None:
 def test_a_profile_made_from_the_recording_is_proven_against_a_filter_without_any(drifting) -> None:
     y, x = drifting
     proof = prove(None, "late_reverb", y, x)
-    cold = HeldOut(profile(), y, x).erle_db(None)
+    cold = Recording(y, x, profile()).held_out.erle_db(None)
     assert proof.erle_before_db == pytest.approx(cold, abs=1.5)  # the two profiles cut at another pause
     assert proof.erle_after_db > proof.erle_before_db + 3.0
 

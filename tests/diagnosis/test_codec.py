@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from edgefilter.diagnosis.diagnose import diagnose, settle
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.recording import Recording
+from edgefilter.diagnosis.recording import Recording, diagnose
+from edgefilter.diagnosis.straightened import Straightened
 from edgefilter.echo.effect import complete, vanishes
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.measurement import Values
@@ -17,7 +17,7 @@ from tests.diagnosis.robot_scene import coded, lossy, profile, record, voice
 SECONDS = 8.0
 
 
-def fitted(recording: np.ndarray, x: np.ndarray) -> tuple[Recording, Values]:
+def fitted(recording: np.ndarray, x: np.ndarray) -> tuple[Straightened, Values]:
     """The codec fitted to a recording beside nothing else."""
     prepared = prepare(profile(), recording, x)
     return prepared, prepared.model.fitted("codec", prepared.measurement)
@@ -38,7 +38,7 @@ def test_a_codec_is_named_with_how_loud_its_noise_is(step_db: float) -> None:
     x = voice(SECONDS)
     recording = record(coded(x, step_db))
     found = diagnose(profile(), recording, x)
-    assert settle(profile(), found, ["codec"], recording, x)[2].irreducible_db == found.irreducible_db
+    assert Recording(recording, x, profile()).settle(found, ["codec"])[2].irreducible_db == found.irreducible_db
     assert [finding.effect for finding in found.ranking] == ["codec"] and found.verdict == "missing"
     finding = found.ranking[0]
     assert finding.excess_after_db < 0.5 * finding.excess_before_db and found.irreducible_db > 2.0

@@ -9,8 +9,8 @@ import pytest
 import soxr
 
 from edgefilter.calibration.from_recording import TAIL_S
-from edgefilter.diagnosis.compare import compare
 from edgefilter.diagnosis.prepare import find_talk, prepare
+from edgefilter.diagnosis.recording import compare
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import SignalError
 from edgefilter.types import PRE_ROLL

@@ -12,12 +12,11 @@ import pytest
 from scipy import signal
 
 from edgefilter.cli import main
-from edgefilter.diagnosis.compare import compare
 from edgefilter.diagnosis.criteria import Criteria
-from edgefilter.diagnosis.diagnose import add, diagnose
 from edgefilter.diagnosis.findings import findings_of
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.recording import bands
+from edgefilter.diagnosis.recording import Recording, add, compare, diagnose
+from edgefilter.diagnosis.straightened import bands
 from edgefilter.diagnosis.trials import Found, Workbench
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.effect import Effect, Parameter
@@ -50,7 +49,7 @@ def test_one_recording_has_one_excess_in_compare_add_diagnose_and_report_when_th
     _, before, _ = add(robot, "playback_gain", recording, x)
     found = diagnose(robot, recording, x)
     assert [finding.effect for finding in found.ranking] == ["playback_gain"]
-    shown = compare_variants(robot, found.model, found.ranking, recording, x)
+    shown = compare_variants(Recording(recording, x, robot).straightened, found.model, found.ranking)
     assert compared > 1.0
     told = (before.excess_db, found.comparison.excess_db, found.ranking[0].excess_before_db, shown[(False,)].excess_db)
     assert told == pytest.approx((compared,) * 4, abs=1e-6)

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from edgefilter.diagnosis.compare import compare
 from edgefilter.diagnosis.criteria import Criteria
-from edgefilter.diagnosis.diagnose import Diagnosis, add, conclude, diagnose, holds
+from edgefilter.diagnosis.diagnose import conclude, holds
 from edgefilter.diagnosis.prepare import prepare
-from edgefilter.diagnosis.recording import Score, bands
+from edgefilter.diagnosis.recording import add, compare, diagnose
+from edgefilter.diagnosis.result import Diagnosis
 from edgefilter.diagnosis.select import search
+from edgefilter.diagnosis.straightened import Score, bands
 from edgefilter.diagnosis.trials import Found, Trial, Workbench
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.effects.bandlimit import band_edge
@@ -208,7 +209,7 @@ def test_where_nothing_is_named_up_to_eight_tenths_of_a_decibel_are_left_by_the_
 
 
 def test_no_effect_is_chosen_where_none_lowers_the_level():
-    bench, score = Workbench(prepare(profile(), record(voice(4.0)), voice(4.0)), Criteria()), verdict(1.0, 1.0)
+    bench, score = Workbench(prepare(profile(), record(voice(4.0)), voice(4.0)), Criteria()), verdict(1.0)
     trials = {
         name: Trial(name, {}, EchoModel(path()), score, gain_db)
         for name, gain_db in (("playback_gain", 0.9), ("late_reverb", 1.0))
@@ -222,7 +223,7 @@ def test_no_effect_is_chosen_where_none_lowers_the_level():
 
 @pytest.mark.parametrize("by_db, chosen", [(0.002, "playback_gain"), (0.05, "limiter")])
 def test_an_effect_of_few_numbers_is_chosen_where_it_explains_more_than_by_chance(by_db, chosen):
-    bench, score = Workbench(prepare(profile(), record(voice(4.0)), voice(4.0)), Criteria()), verdict(1.0, 1.0)
+    bench, score = Workbench(prepare(profile(), record(voice(4.0)), voice(4.0)), Criteria()), verdict(1.0)
     simple, richer = (
         Trial(name, {}, EchoModel(path()), score, gain_db)
         for name, gain_db in (("playback_gain", 10.0), ("limiter", 10.0 + by_db))
@@ -232,7 +233,7 @@ def test_an_effect_of_few_numbers_is_chosen_where_it_explains_more_than_by_chanc
 
 def test_what_ordinary_recordings_show_more_of_than_is_left_is_not_fitted():
     bench = Workbench(prepare(profile(), record(voice(4.0)), voice(4.0)), Criteria())
-    left = replace(verdict(0.3, 0.3), cells=np.ones((bench.recording.starts.size, bands().freedom.size)))
+    left = replace(verdict(0.3), cells=np.ones((bench.recording.starts.size, bands().freedom.size)))
     bench.score = lambda asked: left  # an ordinary loudspeaker's distortion explains twice as much
     model = bench.recording.model
     assert bench.attempt("speaker_nonlinearity", model) is None
@@ -240,7 +241,7 @@ def test_what_ordinary_recordings_show_more_of_than_is_left_is_not_fitted():
     assert (row.name, row.spared, row.alone) == ("speaker_nonlinearity", True, None)
 
 
-def verdict(active_db: float, fitted_db: float) -> Score:
+def verdict(active_db: float) -> Score:
     return Score(
         active_db,
         active_db,
@@ -248,7 +249,6 @@ def verdict(active_db: float, fitted_db: float) -> Score:
         active_db,
         active_db,
         0.0,
-        fitted_db,
         0.0,
         np.ones((4, 4)),
         np.zeros(16000, np.float32),
@@ -259,24 +259,13 @@ def verdict(active_db: float, fitted_db: float) -> Score:
     "base_db, left_db, held", [(15.0, 2.9, True), (15.0, 3.1, False), (25.0, 3.1, True), (4.0, 2.1, False)]
 )
 def test_effects_hold_that_leave_less_than_3_db_or_one_percent_and_less_than_half(base_db, left_db, held):
-    found = Found(None, EchoModel(path()), EchoModel(path()), verdict(base_db, base_db), verdict(left_db, left_db), ())
+    found = Found(None, EchoModel(path()), EchoModel(path()), verdict(base_db), verdict(left_db), ())
     assert holds(found, Criteria()) is held
-
-
-@pytest.mark.parametrize(
-    "name, fitted_db, halved",
-    [("speaker_nonlinearity", 0.5, True), ("speaker_nonlinearity", 2.0, False), ("late_reverb", 0.5, False)],
-)
-def test_half_of_what_a_long_filter_leaves_where_it_was_fitted_is_enough(name, fitted_db, halved):
-    found = prepare(profile(), record(voice(4.0)), voice(4.0))
-    bench, model = Workbench(found, Criteria()), EchoModel(path())
-    bench.score = lambda asked: verdict(6.0, 2.5)
-    assert bench.halves(Trial(name, {}, model, verdict(5.0, fitted_db), 0.5), model) is halved
 
 
 @pytest.mark.parametrize("active_db, halved", [(3.95, True), (3.98, False)])
 def test_half_of_the_power_over_the_fan_is_gone_from_6_dB_at_3_96(active_db, halved):
     found = prepare(profile(), record(voice(4.0)), voice(4.0))
     bench, model = Workbench(found, Criteria()), EchoModel(path())
-    bench.score = lambda asked: verdict(6.0, 2.0)
-    assert bench.halves(Trial("late_reverb", {}, model, verdict(active_db, 2.0), 0.5), model) is halved
+    bench.score = lambda asked: verdict(6.0)
+    assert bench.halves(Trial("late_reverb", {}, model, verdict(active_db), 0.5), model) is halved

@@ -8,8 +8,8 @@ import pytest
 from edgefilter.alignment.belief import believe
 from edgefilter.diagnosis.precision import precision
 from edgefilter.diagnosis.prepare import utterance_lags
-from edgefilter.diagnosis.probe import Inquiry
-from edgefilter.diagnosis.recording import share_of
+from edgefilter.diagnosis.recording import Recording
+from edgefilter.diagnosis.straightened import share_of
 from edgefilter.echo.effects.catalogue import register
 from edgefilter.echo.effects.playback_gain import PlaybackGain
 from edgefilter.echo.model import EchoModel
@@ -43,7 +43,7 @@ def test_an_explanation_that_cannot_be_fitted_is_one_line_that_names_it(error):
     register(Unfit())
     x = voice(2.0)
     with pytest.raises(SignalError, match="late_reverb\\+unfit cannot be fitted to the recording") as caught:
-        Inquiry(profile(), [("late_reverb", "unfit")], record(x, EchoModel(path())), x)
+        Recording(record(x, EchoModel(path())), x, profile()).probe([("late_reverb", "unfit")])
     assert str(error) in str(caught.value) and "\n" not in str(caught.value)
 
 

@@ -14,8 +14,7 @@ import soundfile as sf
 
 from bench.diagnosis import names
 from edgefilter.calibration.calibrate import calibrate
-from edgefilter.diagnosis.compare import compare
-from edgefilter.diagnosis.diagnose import add, diagnose
+from edgefilter.diagnosis.recording import add, compare, diagnose
 from edgefilter.profile.data import Profile
 
 pytestmark = pytest.mark.slow

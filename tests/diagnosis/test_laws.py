@@ -14,9 +14,9 @@ from scipy import ndimage, signal
 
 from edgefilter import add, compare, load_effect
 from edgefilter.diagnosis.criteria import Criteria
-from edgefilter.diagnosis.diagnose import diagnose
 from edgefilter.diagnosis.laws import Law, law_of, with_laws
 from edgefilter.diagnosis.prepare import prepare
+from edgefilter.diagnosis.recording import diagnose
 from edgefilter.diagnosis.trials import Found, Trial
 from edgefilter.echo.effects import catalogue
 from edgefilter.echo.running import stream_form

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from edgefilter.diagnosis.diagnose import diagnose
+from edgefilter.diagnosis.recording import diagnose
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.measurement import Values

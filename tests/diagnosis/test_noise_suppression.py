@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from edgefilter.diagnosis.criteria import Criteria
-from edgefilter.diagnosis.diagnose import add, diagnose
 from edgefilter.diagnosis.prepare import prepare
+from edgefilter.diagnosis.recording import add, diagnose
 from edgefilter.diagnosis.select import search
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel

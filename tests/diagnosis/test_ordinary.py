@@ -6,8 +6,8 @@ from scipy.stats import kstest
 
 from bench.diagnosis.ordinary import learnt, least
 from edgefilter.diagnosis.criteria import Criteria
-from edgefilter.diagnosis.diagnose import diagnose
 from edgefilter.diagnosis.ordinary import LEAST_DB, Chance, Ordinary, explained_db, p_value, percent
+from edgefilter.diagnosis.recording import diagnose
 from edgefilter.echo.effects.catalogue import names
 from edgefilter.echo.model import EchoModel
 from tests.diagnosis.robot_scene import path, profile, record, voice

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from edgefilter.diagnosis.criteria import Criteria
-from edgefilter.diagnosis.diagnose import diagnose
 from edgefilter.diagnosis.prepare import prepare
+from edgefilter.diagnosis.recording import diagnose
 from edgefilter.diagnosis.trials import Workbench
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.running import reach

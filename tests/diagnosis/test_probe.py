@@ -15,7 +15,8 @@ import soundfile
 
 from edgefilter.cli import main
 from edgefilter.diagnosis.advice import asks, remaining
-from edgefilter.diagnosis.probe import ENOUGH, SOUND_S, Answer, Explanation, Inquiry, menu, weights
+from edgefilter.diagnosis.probe import ENOUGH, SOUND_S, Answer, Explanation, menu, weights
+from edgefilter.diagnosis.recording import Recording
 from edgefilter.diagnosis.result import Candidate
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.effects.catalogue import register
@@ -86,7 +87,7 @@ def unsteady(x: np.ndarray, seed: int) -> np.ndarray:
 def test_what_is_nearer_is_named_only_where_it_holds(happened, holds: bool) -> None:
     """Of a volume and a ring the volume is nearer to a volume and to a tremolo, 20 to 1."""
     x, sound = voice(4.0), menu(voice(4.0))["noise"]
-    inquiry = Inquiry(profile(), VOLUME_OR_RING, happened(x, 3), x)
+    inquiry = Recording(happened(x, 3), x, profile()).probe(VOLUME_OR_RING)
     answer = inquiry.answer([inquiry.hear(happened(sound, 5), sound)], [inquiry.gains(sound)], ("noise",))
     assert answer.first.name == "playback_gain" and answer.odds >= ENOUGH
     assert answer.holds == answer.settled == holds
@@ -106,7 +107,7 @@ def follower(x: np.ndarray) -> np.ndarray:
 
 def test_a_law_that_loud_words_have_taught_holds_though_it_errs_in_the_softest_sound() -> None:
     x = voice(12.0)
-    inquiry = Inquiry(profile(), [("playback_gain",), ("compression",)], record(follower(x)), x)
+    inquiry = Recording(record(follower(x)), x, profile()).probe([("playback_gain",), ("compression",)])
     sound = menu(x)["noise, 20 dB softer"]
     heard = inquiry.hear(record(follower(np.pad(sound, (0, SAMPLE_RATE))), seed=5), sound)
     answer = inquiry.answer([heard], [inquiry.gains(sound)], ("noise",))
@@ -117,7 +118,7 @@ def test_a_law_that_loud_words_have_taught_holds_though_it_errs_in_the_softest_s
 @pytest.mark.slow
 def test_what_does_not_hold_is_not_asked_further() -> None:
     x = voice(4.0)
-    inquiry = Inquiry(profile(), VOLUME_OR_RING, trembling(x, 3), x)
+    inquiry = Recording(trembling(x, 3), x, profile()).probe(VOLUME_OR_RING)
     answer = inquiry.ask(lambda sound: trembling(sound.samples, 5), 60.0)
     assert answer.odds >= ENOUGH and not answer.settled and len(answer.sounds) < 24
 
@@ -125,7 +126,7 @@ def test_what_does_not_hold_is_not_asked_further() -> None:
 def test_a_long_filter_that_the_recording_did_not_teach_holds_where_the_sounds_teach_it() -> None:
     """Two seconds of soft speech teach nothing of another path, as much of loud noise does."""
     x, sound, elsewhere = 0.12 * voice(4.0), menu(voice(4.0))["noise"], EchoModel(path(seed=2))
-    inquiry = Inquiry(profile(), [("playback_gain",), ("early_path",)], record(x, elsewhere), x)
+    inquiry = Recording(record(x, elsewhere), x, profile()).probe([("playback_gain",), ("early_path",)])
     heard = inquiry.hear(record(np.pad(sound, (0, SAMPLE_RATE)), elsewhere, seed=5), sound)
     answer = inquiry.answer([heard], [], ("noise",))
     assert answer.first.name == "early_path" and answer.settled and answer.left_db < 1.0  # no more than half of 3.6 dB
@@ -136,7 +137,7 @@ def test_a_long_filter_that_the_recording_did_not_teach_holds_where_the_sounds_t
 @pytest.mark.parametrize("true", [0, 1])
 def test_five_seconds_settle_a_pair_whichever_is_true(pair: str, true: int) -> None:
     x, (name, values) = voice(5.0), PAIRS[pair][true]
-    inquiry = Inquiry(profile(), [(one,) for one, _ in PAIRS[pair]], heard(x, name, values, 3), x)
+    inquiry = Recording(heard(x, name, values, 3), x, profile()).probe([(one,) for one, _ in PAIRS[pair]])
     answer = inquiry.ask(lambda sound: heard(sound.samples, name, values, 5), 5.0)
     assert answer.settled and answer.first.name == name
     assert answer.to_dict()["explanations"][0]["effects"] == (name,)
@@ -212,7 +213,7 @@ def test_a_sound_that_would_not_be_found_again_is_not_played() -> None:
     """Where the clock runs 0.1 % fast and nobody has said so, what is expected of soft sounds is nearly all error."""
     x = voice(8.0)
     fast = np.interp(np.arange(x.size) * 0.999, np.arange(x.size), x).astype(np.float32)
-    inquiry = Inquiry(profile(), [("playback_gain",), ("compression",)], record(0.6 * fast), x)
+    inquiry = Recording(record(0.6 * fast), x, profile()).probe([("playback_gain",), ("compression",)])
     worthy = inquiry.sounds(inquiry.before())
     assert 0 < len(worthy) < len(menu(x)) and worthy[0].expected > 0.0
 
@@ -220,14 +221,14 @@ def test_a_sound_that_would_not_be_found_again_is_not_played() -> None:
 def test_what_predicts_the_same_is_one_explanation_and_an_event_is_none() -> None:
     x, y = voice(4.0), softer(voice(4.0), 3)
     register(Turned())
-    assert len(Inquiry(profile(), [("playback_gain",), ("turned",)], y, x).explanations) == 1
+    assert len(Recording(y, x, profile()).probe([("playback_gain",), ("turned",)]).explanations) == 1
     with pytest.raises(UsageError, match="delay_jump belongs to one recording"):
-        Inquiry(profile(), [("delay_jump",), ("playback_gain",)], y, x)
+        Recording(y, x, profile()).probe([("delay_jump",), ("playback_gain",)])
 
 
 def test_what_differs_only_by_what_the_fan_taught_is_one_explanation() -> None:
     x = voice(4.0)
-    assert len(Inquiry(profile(), VOLUME_OR_RING, record(x, seed=1), x).explanations) == 1
+    assert len(Recording(record(x, seed=1), x, profile()).probe(VOLUME_OR_RING).explanations) == 1
 
 
 def test_a_louder_fan_that_the_profile_knows_is_expected_once() -> None:
@@ -237,7 +238,9 @@ def test_a_louder_fan_that_the_profile_knows_is_expected_once() -> None:
     y = EchoModel(path()).with_effect("playback_gain", {"gain_db": -1.0}).predict(delayed(x, DELAY - PRE_ROLL)) + noise
     louder = calibrated.with_echo(EchoModel(path()).with_effect("fan_noise", {"spectrum_db": 20 * np.log10(2.0)}))
     beside_it = replace(calibrated, noise_psd=4 * calibrated.noise_psd)
-    told, expected = (Inquiry(each, VOLUME_OR_RING, y.astype(np.float32), x).before() for each in (louder, beside_it))
+    told, expected = (
+        Recording(y.astype(np.float32), x, each).probe(VOLUME_OR_RING).before() for each in (louder, beside_it)
+    )
     assert told == pytest.approx(expected, rel=1e-4)
 
 
@@ -245,7 +248,7 @@ def test_a_louder_fan_that_the_profile_knows_is_expected_once() -> None:
 def test_a_question_that_no_sound_answers_is_said() -> None:
     x = voice(4.0)
     y = heard(x, "compression", COMPRESSION, 3)
-    inquiry = Inquiry(profile(), [("playback_gain",), ("compression",)], y, x)
+    inquiry = Recording(y, x, profile()).probe([("playback_gain",), ("compression",)])
     inquiry.explanations = (inquiry.explanations[0],) * 2
     with pytest.raises(SignalError, match="no sound tells playback_gain and playback_gain apart"):
         inquiry.sounds(np.ones(2))

@@ -1,4 +1,4 @@
-"""The likelihood by which everything is scored: noise that is expected is neither free nor forbidden."""
+"""One recording is straightened once for every question; the likelihood: noise that is expected is neither free nor forbidden."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from edgefilter.diagnosis import recording as asked
 from edgefilter.diagnosis.prepare import prepare
+from edgefilter.diagnosis.recording import Recording, add, compare, diagnose
 from edgefilter.dsp.psd import total_power
 from edgefilter.echo.model import EchoModel
 from tests.diagnosis.robot_scene import profile, record, voice
@@ -79,3 +81,29 @@ def test_a_gain_behind_the_microphone_is_expected_on_the_fan_as_well():
     score = recording.of(model)
     assert np.ptp(10 * np.log10(score.cells.mean(axis=1))) < 3.0 and abs(score.over_db) < 0.5
     assert score.level_db < recording.of(prepared.model).level_db - 2.0
+
+
+def test_a_recording_is_straightened_once_for_all_that_is_asked_of_it(monkeypatch) -> None:
+    """Two further profiles hold the effect, and their clock may be another: what these leave is of a recording of their own."""
+    straightened = []
+    monkeypatch.setattr(asked, "prepare", lambda *of: straightened.append(of[0]) or prepare(*of))
+    x, robot = voice(8.0), profile()
+    y = record(x, robot.echo.with_effect("playback_gain", {"gain_db": -3.0}))
+    recording = Recording(y, x, robot)
+    compared, found, proof = recording.compare(), recording.diagnose(), recording.prove("playback_gain")
+    assert [finding.effect for finding in found.ranking] == ["playback_gain"] and not proof.worse
+    assert len(recording.probe([("playback_gain",), ("compression",)]).explanations) == 2
+    assert straightened == [robot]
+    added, settled = recording.add("playback_gain"), recording.settle(found, ["playback_gain"])
+    assert straightened == [robot, added[0], settled[0]]
+    assert compared.to_dict() == compare(robot, y, x).to_dict() and found.to_dict() == diagnose(robot, y, x).to_dict()
+    again = add(robot, "playback_gain", y, x)
+    assert [one.to_dict() for one in added[1:]] == [one.to_dict() for one in again[1:]]
+
+
+def test_a_recording_without_a_profile_makes_one_of_itself() -> None:
+    x = voice(6.0)
+    recording = Recording(record(x), x)
+    assert not recording.known and recording.profile.learned
+    assert recording.compare().excess_db < 2.0  # six seconds teach a path to so much
+    assert Recording(record(x), x, recording.profile).known

@@ -10,7 +10,7 @@ import pytest
 import edgefilter
 
 FUNCTIONS = [name for name in edgefilter.__all__ if inspect.isfunction(getattr(edgefilter, name))]
-CLASSES = ("EgoFilter", "Profile")
+CLASSES = ("EgoFilter", "Profile", "Recording")
 METHODS = [
     f"{name}.{method}"
     for name in CLASSES
@@ -22,8 +22,9 @@ SHORT = {
     "Profile.with_echo",
     "Profile.noise_bins",
     "Profile.response_bins",
+    *(f"Recording.{name}" for name in ("compare", "diagnose", "add", "prove")),
 }
-"""One sentence says all."""
+"""One sentence says all, or points to the function that it is for."""
 
 
 def sections(text):

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from edgefilter.diagnosis.criteria import Criteria
-from edgefilter.diagnosis.diagnose import Finding, diagnose
+from edgefilter.diagnosis.recording import Recording, diagnose
+from edgefilter.diagnosis.result import Finding
 from edgefilter.report.html import comparison_page, diagnosis_page, write_page
 from tests.diagnosis.robot_scene import profile, record, voice
 from tests.live.browser import Browser
@@ -56,14 +57,14 @@ def pages(tmp_path_factory):
     y = record(x, wrong)
     found = diagnose(robot, y, x, criteria=Criteria(false_rate=0.05))  # a distortion that is near the floor
     assert [finding.effect for finding in found.ranking] == ["playback_gain", "speaker_nonlinearity"]
-    write_page(folder / "missing.html", diagnosis_page(robot, found, y, x, NAMES))
+    write_page(folder / "missing.html", diagnosis_page(Recording(y, x, robot), found, NAMES))
     write_page(folder / "comparison.html", comparison_page(found.comparison, NAMES))
     neutral = [Finding(name, "dynamics", 1.0, 0.0, 0.0, 0.0, {}, "", {}, y) for name in ("compression", "clock_drift")]
     model = found.model.with_effect("compression", {}).with_effect("clock_drift", {})
     many = replace(found, ranking=(*found.ranking, *neutral), model=model)
-    write_page(folder / "many.html", diagnosis_page(robot, many, y, x, NAMES))
+    write_page(folder / "many.html", diagnosis_page(Recording(y, x, robot), many, NAMES))
     clean = record(x)
-    write_page(folder / "explained.html", diagnosis_page(robot, diagnose(robot, clean, x), clean, x, NAMES))
+    write_page(folder / "explained.html", diagnosis_page(Recording(clean, x, robot), diagnose(robot, clean, x), NAMES))
     return folder, found
 
 

@@ -13,8 +13,8 @@ import soundfile
 from PIL import Image
 
 from edgefilter.diagnosis.closer_look import CloserLook, Curve
-from edgefilter.diagnosis.compare import compare
-from edgefilter.diagnosis.diagnose import Diagnosis, Finding, Interval
+from edgefilter.diagnosis.recording import Recording, compare
+from edgefilter.diagnosis.result import Diagnosis, Finding, Interval
 from edgefilter.echo.effects.catalogue import EFFECTS, find
 from edgefilter.report import text
 from edgefilter.report.html import choices, compare_variants, diagnosis_page
@@ -179,7 +179,7 @@ def test_subsets_are_compared_on_one_alignment():
     x, robot = voice(6.0), profile()
     model = robot.echo.with_effect("playback_gain", {"gain_db": -3.0})
     y = record(x, model)
-    found = compare_variants(robot, model, [finding("playback_gain", {"gain_db": -3.0})], y, x)
+    found = compare_variants(Recording(y, x, robot).straightened, model, [finding("playback_gain", {"gain_db": -3.0})])
     assert found[(True,)].excess_db < 0.3 < 3 < found[(False,)].excess_db  # 0.3 dB: see the comparison's own tests
     assert found[(True,)].offset_samples == found[(False,)].offset_samples
 
@@ -193,7 +193,7 @@ def test_four_effects_give_five_comparisons_in_the_page():
     for one in four:
         model = model.with_effect(one.effect, one.values)
     found = Diagnosis("missing", compare(robot, y, x), tuple(four), "", 0.1, 0.0, model)
-    page = diagnosis_page(robot, found, y, x, {"profile": "p", "recording": "m", "reference": "r"})
+    page = diagnosis_page(Recording(y, x, robot), found, {"profile": "p", "recording": "m", "reference": "r"})
     assert page.count("<span>add</span>") == 1 and page.index("<span>add</span>") < page.index("Error budget")
     assert page.count('"excess_db"') == 5 and "switched with them" in page
     assert page.count("data:image/png") == 3, (
@@ -206,7 +206,7 @@ def test_the_page_of_what_is_unexplained_draws_a_closer_look_and_says_where():
     y = record(x)
     look = CloserLook((Curve("time", "s", (0.1, 0.2, 0.3), (-3.0, 1.0, 0.0), 0.5),), "look at the gain by time")
     found = Diagnosis("unexplained", compare(robot, y, x), (), "", 9.0, 0.0, robot.echo, closer_look=look)
-    page = diagnosis_page(robot, found, y, x, {"profile": "p", "recording": "m", "reference": "r"})
+    page = diagnosis_page(Recording(y, x, robot), found, {"profile": "p", "recording": "m", "reference": "r"})
     assert "<b>Look at the gain by time.</b>" in page and "By time</b> <small>−3.0 to +1.0 dB" in page
     assert 'points="0.00,40.00 50.00,0.00 100.00,10.00"' in page and 'y1="10.00"' in page
     assert "closer      Look at the gain by time." in diagnosis_lines(found)
@@ -229,7 +229,9 @@ def test_a_switched_on_gain_control_is_scored_as_the_diagnosis_scores_it():
     gain_db = 6 * np.hanning(240)
     model = robot.echo.with_effect("mic_agc", {"gain_db": gain_db, "knots_hz": 40.0})
     y = (record(x) * 10 ** (np.interp(np.arange(x.size) * 40 / 16000, np.arange(240), gain_db) / 20)).astype(np.float32)
-    found = compare_variants(robot, model, [finding("mic_agc", {"gain_db": gain_db, "knots_hz": 40.0})], y, x)
+    found = compare_variants(
+        Recording(y, x, robot).straightened, model, [finding("mic_agc", {"gain_db": gain_db, "knots_hz": 40.0})]
+    )
     assert (
         abs(found[(True,)].excess_db) < 0.3
         and abs(found[(True,)].silence_excess_db) < 0.3 < 3 < found[(False,)].excess_db

@@ -20,9 +20,9 @@ BLOCK = 320
 """Samples (20 ms) over which the energy of taps is summed."""
 DIRECT = 48
 """Samples up to which no reflection of a room comes: a detour of a metre. A change there is another effect's."""
-LONGER, DECAYED = 1.3, 0.01
-"""By this factor the time until DECAYED of the energy is left exceeds the calibration's: 2 to 20 in rooms of 0.4 to 0.8
-s, 0.9 to 1.1 where the change was another one. So far down a sweep's response is clear of its noise."""
+LONGER, LEFT = 1.1, 1e-4
+"""By this factor the centre time exceeds the calibration's: by more in 22 of 24 rooms that reverberators of other people made
+longer, by less in 33 of 36 in which an echo came or robot or microphone had moved. The last LEFT of the energy is noise."""
 
 
 ADDED = Parameter("added", "1", 0.0, -1e3, 1e3), Parameter("taps", "1", 0.0, -10.0, 10.0, given=True)
@@ -104,7 +104,7 @@ def fit_path(measurement: Measurement, model: VoiceModel) -> tuple[Array, float,
     rt60 = reverberation_time(after(taps)) or reverberation_time(before[direct:])
     if rt60 > 0.0:
         taps = fit_filter(x, residual, measurement.weights, length, 0, decaying(taps, SLOWER * rt60), steps=60)
-    return scale * taps, rt60, decay(after(taps)) > LONGER * decay(before[direct:])
+    return scale * taps, rt60, centre_time(after(taps)) > LONGER * centre_time(before[direct:])
 
 
 def beside(measurement: Measurement, model: VoiceModel) -> tuple[Samples, Samples, float]:
@@ -121,10 +121,12 @@ def block_energy(taps: Array) -> tuple[Array, float]:
     return energy, float(np.quantile(energy[2 * count // 3 :], 0.25)) if count >= 3 else 0.0
 
 
-def decay(response: Array) -> int:
-    """Samples until DECAYED of the energy of a response (k,) from lag 0 is left (Schroeder 1965, eq. 5)."""
-    left = np.cumsum(response[::-1] ** 2)[::-1]
-    return int(np.argmax(left <= DECAYED * left[0]))
+def centre_time(response: Array) -> float:
+    """Centre of gravity in samples of the squared response (k,) from lag 0 (ISO 3382-1), the direct sound and the last LEFT left out."""
+    energy = response**2
+    left = np.cumsum(energy[::-1])[::-1]
+    heard = (energy * (left > LEFT * left[0]))[DIRECT:]
+    return float(np.average(np.arange(heard.size) + DIRECT, weights=heard)) if heard.any() else 0.0
 
 
 def decaying(taps: Array, rt60_s: float) -> Array:

@@ -181,3 +181,16 @@ def test_reverberation_lengthens_the_running_filter() -> None:
     )
     assert running.size > 8000 + PRE_ROLL - 32
     assert profile(running).echo.impulse_response.size == running.size
+
+
+def test_an_echo_of_some_milliseconds_is_no_longer_room() -> None:
+    """In a dry room it falls by 20 dB later then; the reflections come twice, and no later in the mean."""
+    x, echo = voice(8.0), np.zeros(160)
+    echo[[0, 102, 115, 119]] = 1.0, 0.2, 0.17, 0.39  # 6.4, 7.2 and 7.4 ms
+    dry = np.where(np.arange(path().size) > PRE_ROLL + 16, 0.3, 1.0) * path()
+    room = EchoModel(np.pad(dry, (0, 1600)).astype(np.float32))
+    heard = np.convolve(room.predict(delayed(x, DELAY - PRE_ROLL)), echo)[: x.size]
+    measurement = measure(heard + FAN * np.random.default_rng(4).standard_normal(x.size), x)
+    late, early = (room.fitted(name, measurement) for name in ("late_reverb", "early_path"))
+    assert late["level_db"] == -120.0 and not np.any(late["added"])
+    assert early["within_ms"] < 9.0
