@@ -257,7 +257,9 @@ class Aligner:
             if begins + MINIMUM <= look.at <= looks[-1].at - WINDOW - MINIMUM:
                 looks.append(look)
         self._looks.append(found)
-        agree = any(abs(look.lag - found.lag) <= NEAR for look in looks[1:])
+        # where the arrival is another than was calibrated, looks that are more likely wrong than right are all wrong alike
+        least = 0.0 if self._responses is None else 1.0
+        agree = any(min(look.odds, found.odds) > least and abs(look.lag - found.lag) <= NEAR for look in looks[1:])
         if not agree and (found.lag < -WAIT or not (reached or len(looks) == 1)):
             return 0.0  # a late reference is rare: two searches must show it
         if reached or not agree:
