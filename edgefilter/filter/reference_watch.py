@@ -223,10 +223,7 @@ class ReferenceWatch:
         )
 
     def _look(self, aligned: Aligned) -> str:
-        """Take a look, in three hops, or the lag that the aligner follows for one; say once that the reference is late.
-
-        Of a robot that is heard some looks show the lag, of one that is not heard few a voice: where neither can be, it is another sound.
-        """
+        """Take a look, in three hops, or the lag that the aligner follows for one; say once that the reference is late."""
         now, stage, self._stage = self._ref.end, self._stage, 0
         found = None
         if aligned.state in ("locked", "coarse") and self.verdict != "late":
@@ -252,6 +249,7 @@ class ReferenceWatch:
             self._missing = belief.missing
         if self._onsets.varies:
             self._levels.append(self._loudest / self._least)
+        # of a robot that is heard some looks show the lag, of one that is not few a voice: where neither is so, it is another sound
         sounding = 2 * sum(level > VARIES for level in self._levels) - len(self._levels)
         unlike = np.logaddexp(belief.evidence, sounding * math.log(OTHERS / (1.0 - OTHERS)))
         self._another, self._loudest = bool(unlike < -math.log(CERTAIN)), 0.0
