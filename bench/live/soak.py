@@ -45,8 +45,8 @@ LEARNER_GROWTH_MB = 50.0
 """The same of the learner, its most in the later half over its most in the earlier one. A round's arrays come and go, so
 that it swings by 150 MB; 37 minutes that rose to 420 MB by the 13th were 210 to 220 MB whenever the heap was trimmed."""
 WARM_UP_S = 60.0
-"""Least warm-up. The learner's first fits are as long as what was recorded by then, and on a busy machine the process itself
-still grew by 3.3 MB between the 15th and the 20th second."""
+"""Least warm-up. The learner's first fits need the more memory, the more was recorded by then; and on a busy machine the process
+itself still grew by 3.3 MB between the 15th and the 20th second."""
 SLOWER = 1.3
 """Most growth of a block's processor time over that of a bypassed block, second half over first. A shared machine
 changes its speed by more than that, and the bypass with it."""

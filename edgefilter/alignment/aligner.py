@@ -269,7 +269,7 @@ class Aligner:
         return float(right / max(1.0 - right, math.exp(-SUREST)))
 
     def _take(self, found: Found, odds: float) -> bool:
-        """Believe a lag; True if the delay was switched."""
+        """Accept this lag as the robot's; return whether the delay of the reference has changed."""
         self._log_odds = min(math.log(odds), SUREST)
         if self._expected is not None:
             return self._begin(self._expected.start + found.lag)

@@ -53,7 +53,7 @@ class Belief:
 
     @property
     def certain(self) -> Array:
-        """The lags that are certain, (k,)."""
+        """The lags, samples, whose probability is above CERTAIN to one, (k,)."""
         return self.lags[self.probability > CERTAIN / (CERTAIN + 1.0)]
 
     @property

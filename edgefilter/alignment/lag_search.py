@@ -59,7 +59,7 @@ class Found:
 
     @property
     def prior(self) -> float:
-        """How likely such a lag is before anything is heard, over one that a robot usually has."""
+        """Probability of this lag before anything is heard, divided by that of a lag that robots usually have."""
         return EARLY_ODDS if self.lag < -WAIT else 1.0
 
     @property
@@ -90,7 +90,7 @@ class LagSearch:
         self._phases = {size: [_phase(one, size) for one in responses or ()] for size in (self.span, self._short)}
 
     def prepare(self, ref: Tape | Playback, now: int, since: int) -> None:
-        """Take the reference between the positions since and now."""
+        """Read the reference from sample counter `since` to `now` and transform it, for `listen` to correlate with."""
         self._size = size = self._short if now - since <= self._short - self._early - self._window else self.span
         self._lags = self._early + min(self._max_lag, size - self._early - self._window)
         first = max(since - (now - size), self._early)
@@ -155,7 +155,7 @@ class LagSearch:
         return Found(lag, float(score[at]) / max(float(second), 1e-12), self._at, heard)
 
     def _whitened(self, heard: Samples, reference: np.ndarray, number: int) -> np.ndarray:
-        """Cross-spectrum of what a microphone heard (n,) with the flattened reference, without rumble and its response's phase."""
+        """Whitened cross-spectrum of a microphone's sound (n,) and the reference, 0 below LOWEST_HZ, without the phase of the known path."""
         cross = flattened(fft.rfft(heard), 1e-6) * np.conj(reference)
         cross[: int(LOWEST_HZ * heard.size / SAMPLE_RATE)] = 0.0
         if self._signed:

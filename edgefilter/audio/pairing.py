@@ -119,7 +119,7 @@ class Pairing:
         self._at, self.queued, self.skipped = self._at - count, self.queued + count, self.skipped - count
 
     def drop(self, count: int) -> None:
-        """Leave out so many samples of the reference, which are not played."""
+        """Remove so many samples from the front of the queued reference: they will never be played."""
         self.dropped += self._take(count).size
         self._ref, self._at = self._ref[self._at :], 0
 

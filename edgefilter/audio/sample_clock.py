@@ -8,7 +8,7 @@ LOOK_S, STALL_S = 0.15, 0.25
 """How long a small delay must last to count as lost sound, longer than transports of 100 ms are quiet; and a delay that
 counts after a tenth of that: a program that stood still for so long finds all that it has missed waiting."""
 HELD_S = 0.1
-"""Seconds of delay from which on samples are held back until it is clear whether some were lost."""
+"""Lateness of a block, seconds, from which on its samples wait until it is clear whether some were lost."""
 TOLERANCE_S = 0.01
 """Seconds of delay that come and go with the phase of callbacks."""
 LEAST_LOOK = 0.1

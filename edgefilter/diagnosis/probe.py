@@ -371,7 +371,7 @@ def _fitted(measurement: Measurement, model: EchoModel, effects: Sequence[str]) 
 
 
 def _halves(prepared: Straightened) -> tuple[Straightened, Straightened]:
-    """The same with one half to fit to and the other to test on, and the other way round."""
+    """Fit to one half of the cells and test on the other, then the other way round."""
     return prepared, prepared.fitted_to(prepared.held_out)
 
 

@@ -126,7 +126,7 @@ class HeldOut:
 
 
 def listed(names: str | Sequence[str]) -> tuple[str, ...]:
-    """The names, each once, of one or several effects."""
+    """The names as a tuple without repeats; one name may be given as a text."""
     return (names,) if isinstance(names, str) else tuple(dict.fromkeys(names))
 
 
@@ -138,7 +138,7 @@ def lasts(name: str) -> bool:
 def with_fitted(
     profile: Profile, prepared: Straightened, names: Sequence[str]
 ) -> tuple[Profile, EchoModel, tuple[str, ...]]:
-    """The profile with those effects fitted; the fitted model and the names of what was straightened in it."""
+    """Fit these effects to the recording: the profile with them, the fitted model, and the names of straightened effects in it."""
     model, straightened = fit_straight(prepared, names) if names else (prepared.model, ())
     echo, values = profile.echo, dict(model.effects)
     for name in names:

@@ -142,12 +142,12 @@ class Straightened:
 
     @cached_property
     def active_cells(self) -> NDArray[np.bool_]:
-        """Those in which the robot is heard, (times,)."""
+        """Mask of the times at which the robot is heard, (times,) bool."""
         return _within(self.active, self.starts) > 0.3 * SPAN
 
     @property
     def silent_cells(self) -> NDArray[np.bool_]:
-        """Those in which it is not, (times,): none where they are too few to tell."""
+        """Mask of the times at which it is not, (times,) bool; all False where they are too few to tell."""
         silent = ~self.active_cells
         return silent & (np.count_nonzero(silent) >= FEWEST)
 
@@ -273,7 +273,7 @@ def _within(x: NDArray[np.generic], starts: NDArray[np.integer]) -> Array:
 
 
 def _mean(cells: Array) -> float:
-    """Mean over cells (times, bands), each by its degrees of freedom; 0 where there is none."""
+    """Mean of values (times, bands), each cell weighted by its degrees of freedom; 0 of no cells."""
     return float(np.average(cells.mean(axis=0), weights=bands().freedom)) if cells.size else 0.0
 
 

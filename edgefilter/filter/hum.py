@@ -28,13 +28,13 @@ class Hum:
         self._tune(np.array(TONES_HZ))
 
     def step(self, x: Samples) -> Samples:
-        """The next hop x (..., hop), without its hum where that is known."""
+        """Filter the next hop x (..., hop): return it without hum once hum has been found, unchanged before."""
         left = x - (self._tones @ self._waves).real
         self._tones = (self._tones + self._rate * (left @ self._waves.conj().T)) * self._hop_turn
         if self.known:
             return left
         self._hops = (self._hops + 1) % self._second
-        if self._hops <= self._second // 2:  # a notch that has only begun says nothing
+        if self._hops <= self._second // 2:  # the notch still settles, so what it takes off is not measured yet
             self._before = self._tones
         else:
             self._more += float(np.vdot(x, x)) - 2.0 * float(np.vdot(left, left))

@@ -111,7 +111,7 @@ class ReferenceWatch:
         self._ref.push(ref)
         if self._onsets.step(ref):
             self._next, self._loudest = self._ref.end + DOUBT, 0.0
-        self._idle = aligned.state in ("idle", "announced")  # what was announced is no reference before it is heard
+        self._idle = aligned.state in ("idle", "announced")  # announced speech is no reference before its echo is heard
         power, played = float(mic.dot(mic)) / self._hop, float(ref.dot(ref)) / self._hop
         self._loudest = max(self._loudest, self._sustained.step(power))
         if power > FLOOR:
