@@ -87,7 +87,8 @@ def _apply(
     """Write the profile with all effects that were found: what was fitted, and the error that kept it from being written.
 
     One of the two is None, and both where nothing was found: the diagnosis is printed in any case. A profile made from the
-    recording gets the whole length of the room's response, from all of the recording. array: the other microphones, which get the same effects on their own paths.
+    recording gets the whole length of the room's response, from all of the recording. array: the other microphones, which get
+    the same effects on their own paths.
     """
     step("fit of what was found, and proof in the running filter")
     names = [finding.effect for finding in in_order(found.ranking)]
