@@ -556,12 +556,12 @@ def test_a_client_whose_messages_would_fill_the_memory_is_told_and_what_it_sent_
     kept = []
 
     class Kept(EgoFilter):
-        def __init__(self, *args):
-            super().__init__(*args)
+        def __init__(self, **settings):
+            super().__init__(**settings)
             kept.append(weakref.ref(self))
 
     async def talk():
-        service = Service(lambda learns, output: Kept(None, "linear"), 1, 0, None)
+        service = Service(lambda learns, output: Kept(engine="linear"), 1, 0, None)
         async with served(service) as address:
             gc.disable()
             try:
@@ -598,7 +598,7 @@ def test_beside_clients_that_send_4_MB_at_once_a_stream_in_real_time_is_filtered
     filters = []
 
     def make(learns, output):
-        filters.append(Counting(None, "linear"))
+        filters.append(Counting(engine="linear"))
         return filters[-1]
 
     async def flood(address):
@@ -634,7 +634,7 @@ def test_a_client_that_is_behind_catches_up_before_others_go_on():
     filters = []
 
     def make(learns, output):
-        filters.append(Counting(None, "linear"))
+        filters.append(Counting(engine="linear"))
         return filters[-1]
 
     async def talk():

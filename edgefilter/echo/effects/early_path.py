@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from edgefilter.echo.effect import Effect, Parameter, first, neutral, within
-from edgefilter.echo.effects.late_reverb import ADDED, fit_path, with_added
+from edgefilter.echo.effects.late_reverb import ADDED, DIRECT, fit_path, with_added
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 
@@ -38,11 +38,14 @@ class EarlyPath(Effect):
         return with_added(x, values)
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """What fit_path() finds, which late_reverb shares; neutral where none of it holds on other samples, or the room sounds longer."""
+        """What fit_path() finds, which late_reverb shares.
+
+        Neutral where none of it holds on other samples, where it changes the direct sound alone, or where the room sounds longer.
+        """
         added, _, longer = measurement.once(fit_path, model)
-        if longer or not added.any():
-            return neutral(self)
         grown = np.cumsum(added**2)
+        if longer or grown[PRE_ROLL + DIRECT] >= WITHIN * grown[-1]:
+            return neutral(self)
         level_db = 10.0 * np.log10(grown[-1] / np.sum(model.response().astype(float) ** 2) + 1e-12)
         within_ms = 1e3 * (int(np.searchsorted(grown, WITHIN * grown[-1])) - PRE_ROLL) / SAMPLE_RATE
         return within(self, {"level_db": level_db, "within_ms": within_ms, "added": added})
