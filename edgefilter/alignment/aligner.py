@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
-from edgefilter.alignment.belief import believed
 from edgefilter.alignment.coarse_lag import CoarseLag
 from edgefilter.alignment.delay_line import HALF_WIDTH, WAIT, Aligned, Tape, kernel_table, read_delayed, read_line
 from edgefilter.alignment.delay_tracker import DRIFTED, FAINT, SIZE, STRIDE, DelayMeasurement, DelayMeter, DriftFilter
-from edgefilter.alignment.lag_search import CERTAIN, MINIMUM, MOST_LAG_S, NEAR, REFLECTIONS, WINDOW, Found, LagSearch
+from edgefilter.alignment.lag_search import CERTAIN, MINIMUM, MOST_LAG_S, REFLECTIONS, SEEN_ODDS, Found, LagSearch
 from edgefilter.alignment.utterances import AHEAD, Announcements, FirstSounds, OnsetDetector, Playback, Utterance
 from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, AlignmentCounts, AlignmentState, AlignmentStats, Samples
@@ -84,7 +82,7 @@ class Aligner:
         self._open: deque[Utterance] = deque(maxlen=32)
         self._announced = Announcements()
         self._expected: Playback | None = None
-        self._looks: deque[Found] = deque(maxlen=self._latest // SEARCH_STRIDE)
+        self._found: Found | None = None
         self._read_at, self._wait = float("nan"), 0
         self._to_search, self._to_measure, self._stage, self._far = SEARCH_STRIDE, STRIDE // 2, 0, False
         self._gain: float | None = None
@@ -239,38 +237,21 @@ class Aligner:
             heard_out = self._open[0].after + int(self._drift.delay) if self._open and self._trusted else 0
             together = self._used if self._responses is not None else self._used[:1]
             self._lags.listen({at: self._mics[at] for at in together}, now, heard_out)
-        elif found := self._lags.find():
-            odds = self._odds(found)
-            return odds > CERTAIN and self._take(found, odds)
+        elif stage == 2:
+            found = self._lags.find()
+            if found is not None and found.old and found.odds * SEEN_ODDS > CERTAIN:
+                self._found, self._stage = found, 3
+            # a reference that comes after its echo is rare: two windows must show it
+            fresh = found is not None and not found.old and found.lag >= -WAIT and found.odds > CERTAIN
+            return found is not None and fresh and self._take(found)
+        elif found := self._found:
+            first, ref = self._used[0], self._expected or self._ref
+            return self._lags.before(first, self._mics[first], ref, found) and self._take(found)
         return False
 
-    def _odds(self, found: Found) -> float:
-        """Odds of a lag after a search and those before it that would have shown it in other sound, of which one must.
-
-        Beside the present delay, where reflections agree as well, jumps are the tracker's, and a search counts alone.
-        """
-        reached = self._expected is None and self._drift.reaches(found.lag)
-        if self._expected:
-            found = replace(found, lag=found.lag + self._expected.start)
-        begins, looks = found.at - found.heard, [found]
-        for look in reversed(self._looks):
-            if begins + MINIMUM <= look.at <= looks[-1].at - WINDOW - MINIMUM:
-                looks.append(look)
-        self._looks.append(found)
-        # where the arrival is another than was calibrated, looks that are more likely wrong than right are all wrong alike
-        least = 0.0 if self._responses is None else 1.0
-        agree = any(min(look.odds, found.odds) > least and abs(look.lag - found.lag) <= NEAR for look in looks[1:])
-        if not agree and (found.lag < -WAIT or not (reached or len(looks) == 1)):
-            return 0.0  # a late reference is rare: two searches must show it
-        if reached or not agree:
-            return found.odds
-        belief = believed(looks[::-1])
-        right = belief.probability[-1] if belief.lags[-1] == found.lag else 0.0
-        return float(right / max(1.0 - right, math.exp(-SUREST)))
-
-    def _take(self, found: Found, odds: float) -> bool:
+    def _take(self, found: Found) -> bool:
         """Accept this lag as the robot's; return whether the delay of the reference has changed."""
-        self._log_odds = min(math.log(odds), SUREST)
+        self._log_odds = min(math.log(found.odds * (SEEN_ODDS if found.old else 1.0)), SUREST)
         if self._expected is not None:
             return self._begin(self._expected.start + found.lag)
         was_refuted = self._refuted

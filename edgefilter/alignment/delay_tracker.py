@@ -273,10 +273,6 @@ class DriftFilter:
         self._covariance += samples * self._slope_variance
         self._slope_variance += (0.15e-6) ** 2 * samples / STRIDE
 
-    def reaches(self, lag: float) -> bool:
-        """Whether a lag is not the present delay, and looks there see it as well, so that a jump to it is theirs to tell."""
-        return 2 * NEAR <= abs(lag - self.delay) < REACH
-
     def surprise(self, measurement: DelayMeasurement) -> float:
         """The measured offset in standard deviations of what was to be expected."""
         return abs(measurement.offset) / math.sqrt(self._expected()[2] + self._noise(measurement))

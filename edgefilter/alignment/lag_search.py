@@ -27,8 +27,14 @@ REFLECTIONS, REFLECTED = 320, 0.75
 """Peaks up to 20 ms behind an arrival may be its reflections and count only this much against it."""
 COARSE = 32
 """Lags that share one normalisation: the energy of what overlaps is summed up in steps of so many samples."""
-NEAR = 12
-"""Lags on each side of a peak that belong to it."""
+NEAR, ASIDE = 12, 512
+"""Lags on each side of a peak that belong to it, and lags on each side of the one found over which `before` correlates the
+earlier window."""
+BETWEEN = 1024
+"""Samples between the two windows, so that one short agreement does not reach into both."""
+SEEN, SEEN_ODDS = 5.0, 20.0
+"""Strength in the window before from which on it shows the lag as well, and how much more often it does where the lag is true: true
+lags have 10 there, chance 3.3."""
 EVEN, STEEP, EARLY_ODDS = 1.37, 9.9, 0.05
 """Clearness of a lag that is as likely right as not, the power of it that the odds grow with, and what is left of the odds where the
 reference would come more than WAIT after its echo. Fitted to 12 minutes of robots in measured rooms, beside noise and humans
@@ -58,6 +64,11 @@ class Found:
         return cls(lag, EVEN * odds ** (1.0 / STEEP), at)
 
     @property
+    def old(self) -> bool:
+        """Whether the utterance would have sounded for so long that the window before must show it too."""
+        return self.heard > WINDOW + BETWEEN + MINIMUM
+
+    @property
     def prior(self) -> float:
         """Probability of this lag before anything is heard, divided by that of a lag that robots usually have."""
         return EARLY_ODDS if self.lag < -WAIT else 1.0
@@ -76,8 +87,8 @@ class LagSearch:
     that early reflections do not pull the peak, and the peaks of all microphones lie at one lag. Chance peaks grow with the
     root of the energy that a lag lets overlap, so the correlation is divided by that. `prepare`, `listen` and `find` are one
     search and cost one transform each, `listen` one a microphone, so that they can be spread over three hops; while the
-    reference to be looked at is short, so are the transforms. early: samples by which the reference may be late. window: samples
-    of a microphone that are looked at.
+    reference to be looked at is short, so are the transforms. early: samples by which the reference may be late. window: another
+    length than WINDOW; `before` takes none.
     """
 
     def __init__(
@@ -87,7 +98,8 @@ class LagSearch:
         self.span = self._size = COARSE * fft.next_fast_len(-(-(max_lag + early + window) // COARSE), real=True)
         self._signed = responses is not None
         self._short = COARSE * fft.next_fast_len(-(-self.span // (2 * COARSE)), real=True)
-        self._phases = {size: [_phase(one, size) for one in responses or ()] for size in (self.span, self._short)}
+        sizes = (self.span, self._short, WINDOW + 2 * ASIDE)
+        self._phases = {size: [_phase(one, size) for one in responses or ()] for size in sizes}
 
     def prepare(self, ref: Tape | Playback, now: int, since: int) -> None:
         """Read the reference from sample counter `since` to `now` and transform it, for `listen` to correlate with."""
@@ -153,6 +165,21 @@ class LagSearch:
         earlier, later = score[: max(at - NEAR, 0)].max(initial=0.0), score[at + REFLECTIONS :].max(initial=0.0)
         second = max(earlier, REFLECTED * score[at + NEAR : at + REFLECTIONS].max(initial=0.0), later)
         return Found(lag, float(score[at]) / max(float(second), 1e-12), self._at, heard)
+
+    def before(self, number: int, mic: Tape, ref: Tape | Playback, found: Found) -> bool:
+        """Whether a microphone's window BETWEEN samples before the one that the lag was found in shows it as well."""
+        stop = found.at - WINDOW - BETWEEN
+        x = np.zeros(WINDOW + 2 * ASIDE, np.float32)
+        x[ASIDE:-ASIDE] = mic.read(stop - WINDOW, stop)
+        _soften(x[ASIDE:-ASIDE])
+        r = ref.read(stop - WINDOW - found.lag - ASIDE, stop - found.lag + ASIDE).copy()
+        _soften(r)
+        cross = self._whitened(x, flattened(fft.rfft(r), 1e-5), number)
+        score = np.roll(fft.irfft(cross, x.size), ASIDE)[: 2 * ASIDE]
+        if not self._signed:
+            np.abs(score, out=score)
+        spread = float(np.sqrt(np.mean(np.square(score)))) + 1e-20
+        return float(score[ASIDE - NEAR : ASIDE + NEAR].max()) / spread > SEEN
 
     def _whitened(self, heard: Samples, reference: np.ndarray, number: int) -> np.ndarray:
         """Whitened cross-spectrum of a microphone's sound (n,) and the reference, 0 below LOWEST_HZ, without the phase of the known path."""

@@ -86,16 +86,6 @@ def test_a_far_look_sees_three_times_as_far():
     assert seen(look(3007.0), far=True) == "elsewhere" and seen(look(3009.0), far=True) == "unseen"
 
 
-@pytest.mark.parametrize(
-    ("lag", "reached"), [(1023, False), (1024, True), (2023, True), (2024, False), (-24, False), (-23, True)]
-)
-def test_a_jump_is_the_tracker_s_from_24_samples_on_and_below_1024(lag, reached):
-    drift = DriftFilter()
-    assert not drift.reaches(lag)
-    drift.restart(1000.0, 1.0)
-    assert drift.reaches(lag) == reached
-
-
 @pytest.mark.parametrize(("offset", "enough"), [(8.0, 20.0), (8.1, 30.0), (1024.0, 30.0), (-1025.0, 50.0)])
 def test_a_jump_is_believed_from_so_much_evidence_on_as_chance_has_places(offset, enough):
     for share, believed in ((0.99, False), (1.01, True)):
