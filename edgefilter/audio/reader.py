@@ -14,11 +14,10 @@ import soundfile
 import soxr
 
 from edgefilter.audio.raw import delivered
+from edgefilter.dsp.resample import RATES
 from edgefilter.errors import AudioFileError
 from edgefilter.types import LOUDEST, SAMPLE_RATE, Array, Samples, which_channels
 
-RATES = range(1000, 768001)
-"""Hz that converters have; a header that says another is damaged."""
 OTHER_FORMS = {
     b"ftyp": "an MPEG-4 file (m4a, mp4)",
     b"\x1aE\xdf\xa3": "a Matroska file (webm, mkv)",

@@ -21,17 +21,17 @@ MOST_PHASES = 512
 """Kernels that are tabulated; where the rates have more, lines between two of them err by -80 dB at most."""
 
 
-RATES = 8_000, 192_000
-"""Lowest and highest rate of a recording, Hz."""
+RATES = range(1000, 768001)
+"""Of recordings, Hz: a file of another has a damaged header."""
 
 
 def at_16_khz(recording: Samples, sample_rate: int) -> Samples:
     """A recording (n,) or (n, channels) at that rate, converted to 16 kHz; as it is where that is its rate.
 
-    Raises UsageError for a rate outside of 8 to 192 kHz. What else is wrong with it is left to those who take it.
+    Raises UsageError for a rate that is not among RATES. What else is wrong with it is left to those who take it.
     """
-    if not RATES[0] <= sample_rate <= RATES[1]:
-        raise UsageError(f"sample_rate is {sample_rate}, expected {RATES[0]} to {RATES[1]} Hz")
+    if sample_rate not in RATES:
+        raise UsageError(f"sample_rate is {sample_rate}, expected {RATES[0]} to {RATES[-1]} Hz")
     if sample_rate == SAMPLE_RATE or np.ndim(recording) not in (1, 2):
         return recording
     import soxr  # a learner beside the filter needs its memory more

@@ -38,7 +38,7 @@ from wyoming.snd import Played
 from wyoming.vad import VoiceStarted, VoiceStopped
 
 from edgefilter import __version__
-from edgefilter.audio.reader import RATES
+from edgefilter.dsp.resample import RATES
 from edgefilter.errors import EdgefilterError, SignalError, UsageError, printable
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
