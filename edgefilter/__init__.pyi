@@ -7,6 +7,7 @@ from .calibration.multisine import generate_multisine as generate_multisine
 from .calibration.sweep import generate_sweep as generate_sweep
 from .diagnosis.compare import Comparison as Comparison
 from .diagnosis.proof import Proof as Proof
+from .diagnosis.recording import Added as Added
 from .diagnosis.recording import Recording as Recording
 from .diagnosis.recording import add as add
 from .diagnosis.recording import compare as compare

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from functools import cached_property
+from typing import NamedTuple
 
 from edgefilter.calibration.from_recording import self_calibrate
 from edgefilter.diagnosis.compare import Comparison, describe
@@ -25,6 +26,14 @@ from edgefilter.types import SAMPLE_RATE, Samples
 
 PROMISE_DB = 0.5
 """What is written may leave so much more than the diagnosis did, as it says, before it is asked why: intervals are as wide."""
+
+
+class Added(NamedTuple):
+    """A profile with effects that were fitted to a recording, and the comparisons with it before and after."""
+
+    profile: Profile
+    before: Comparison
+    after: Comparison
 
 
 class Recording:
@@ -138,13 +147,13 @@ class Recording:
                 return _told(found, disproved, proof)
             disproved[proof.culprit or names[0]] = proof
 
-    def add(self, names: str | Sequence[str]) -> tuple[Profile, Comparison, Comparison]:
+    def add(self, names: str | Sequence[str]) -> Added:
         """Fit effects, beside each other, and write them into a new profile: `add`."""
         prepared = self.straightened
         knowing, model, straightened = with_fitted(self.profile, prepared, listed(names))
         before, after = self.compare(), Recording(self.mic, self.reference, knowing).compare()
         if not straightened:
-            return knowing, before, after
+            return Added(knowing, before, after)
         values, straight = dict(model.effects), prepared.model
         for name in straightened:
             straight = straight.with_effect(name, values[name])
@@ -152,7 +161,7 @@ class Recording:
         left = f"{before.excess_db:.1f} dB over the noise floor before, {after.excess_db:.1f} dB after"
         told += (f"with that left in, as compare has it: {left}",)
         told_of = replace(prepared, warnings=(*told, *prepared.warnings))
-        return knowing, describe(told_of, straight), describe(told_of, model)
+        return Added(knowing, describe(told_of, straight), describe(told_of, model))
 
     def settle(self, found: Diagnosis, names: Sequence[str]) -> tuple[Profile, Comparison, Diagnosis]:
         """Write findings of a diagnosis into a new profile.
@@ -303,7 +312,7 @@ def add(
     reference: Samples,
     *,
     sample_rate: int = SAMPLE_RATE,
-) -> tuple[Profile, Comparison, Comparison]:
+) -> Added:
     """Fit one or several effects to a recording, beside each other, and write them into a new profile.
 
     Parameters
@@ -315,10 +324,9 @@ def add(
 
     Returns
     -------
-    Profile
-        With the effects.
-    Comparison, Comparison
-        Before and after, both of the straightened recording; its warnings say what was straightened.
+    Added
+        `profile` with the effects; the comparisons `before` and `after`, both of the straightened recording, whose warnings say
+        what was straightened.
 
     Raises
     ------
@@ -343,8 +351,8 @@ def add(
     >>> fan = lambda n: 1e-3 * rng.standard_normal(n).astype(np.float32)
     >>> profile = calibrate(sweep, 0.5 * np.roll(sweep, 300) + fan(sweep.size), fan(64_000))
     >>> said = (0.2 * rng.standard_normal(80_000) * np.repeat(rng.uniform(size=25) > 0.3, 3200)).astype(np.float32)
-    >>> better, before, after = add(profile, "playback_gain", 0.4 * np.roll(said, 300) + fan(said.size), said)
-    >>> [name for name, _ in better.echo.effects], after.excess_db < before.excess_db - 6
+    >>> found = add(profile, "playback_gain", 0.4 * np.roll(said, 300) + fan(said.size), said)
+    >>> [name for name, _ in found.profile.echo.effects], found.after.excess_db < found.before.excess_db - 6
     (['playback_gain'], True)
     """
     return Recording(recording, reference, profile, sample_rate=sample_rate).add(names)
