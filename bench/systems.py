@@ -29,7 +29,7 @@ from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines import HAVE_MODEL, create
 from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.filter.budget import versions
-from edgefilter.filter.echo_path import FilteredHop, Learner, Lesson, PathState
+from edgefilter.filter.echo_path import FilteredHop, Learner, PathState, PathUpdate
 from edgefilter.types import SAMPLE_RATE, Samples, SoundFor
 
 OWN = ("linear", "ss", "crnn")
@@ -175,7 +175,7 @@ def _own(engine: str, way: str, model: Path | None = None, name: str = "", title
         profile = clip.profile if wanted.calibrated else None
         if must and profile is None:
             raise NotHere("no calibration of this device")
-        learner = _lessons(clip.fingerprint, profile) if wanted.learning else None
+        learner = _updates(clip.fingerprint, profile) if wanted.learning else None
         return run_engine(wanted, clip.signals, profile, learner, model)
 
     def missing() -> object:
@@ -283,11 +283,11 @@ def _latency_ms(engine: str) -> float | None:
 
 
 class _Kept:
-    """Learns a recording once and says it again to the next engine, since no lesson depends on the engine."""
+    """Learns a recording once and says it again to the next engine, since no update depends on the engine."""
 
     def __init__(self, profile: Profile | None) -> None:
         self._learner: Learner | None = PathLearner(profile)
-        self._lessons: dict[int, Lesson] = {}
+        self._updates: dict[int, PathUpdate] = {}
         self._at = 0
 
     def start(self, path: PathState, hop: int) -> None:
@@ -296,11 +296,11 @@ class _Kept:
         if self._learner:
             self._learner.start(path, hop)
 
-    def observe(self, hop: FilteredHop) -> Lesson | None:
+    def observe(self, hop: FilteredHop) -> PathUpdate | None:
         self._at += 1
-        if self._learner and (lesson := self._learner.observe(hop)):
-            self._lessons[self._at] = lesson
-        return self._lessons.get(self._at)
+        if self._learner and (update := self._learner.observe(hop)):
+            self._updates[self._at] = update
+        return self._updates.get(self._at)
 
     def stats(self) -> dict[str, object]:
         return {}
@@ -311,7 +311,7 @@ class _Kept:
 _latest: dict[tuple[str, bool], _Kept] = {}
 
 
-def _lessons(recording: str, profile: Profile | None) -> _Kept:
+def _updates(recording: str, profile: Profile | None) -> _Kept:
     """The learner that has taken this recording before, or a new one; at most four are kept."""
     key = (recording, profile is not None)
     if key not in _latest:

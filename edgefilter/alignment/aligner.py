@@ -9,7 +9,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from edgefilter.alignment.coarse_lag import CoarseLag
-from edgefilter.alignment.delay_line import HALF_WIDTH, WAIT, Aligned, Tape, kernel_table, read_delayed, read_line
+from edgefilter.alignment.delay_line import (
+    HALF_WIDTH,
+    WAIT,
+    Aligned,
+    DelayBuffer,
+    kernel_table,
+    read_delayed,
+    read_line,
+)
 from edgefilter.alignment.delay_tracker import DRIFTED, FAINT, SIZE, STRIDE, DelayMeasurement, DelayMeter, DriftFilter
 from edgefilter.alignment.lag_search import CERTAIN, MINIMUM, MOST_LAG_S, REFLECTIONS, SEEN_ODDS, Found, LagSearch
 from edgefilter.alignment.utterances import AHEAD, Announcements, FirstSounds, OnsetDetector, Playback, Utterance
@@ -75,8 +83,8 @@ class Aligner:
         if self._first:
             self._first.reset()
         self._listen_for(self._calibrated)
-        self._ref = Tape(self._lags.span + SAMPLE_RATE)
-        self._mics = [Tape(self._ref.capacity)]
+        self._ref = DelayBuffer(self._lags.span + SAMPLE_RATE)
+        self._mics = [DelayBuffer(self._ref.capacity)]
         self._onsets = OnsetDetector(self.hop)
         self._drift = DriftFilter()
         self._open: deque[Utterance] = deque(maxlen=32)
@@ -97,7 +105,7 @@ class Aligner:
 
     def hear_by(self, used: Sequence[int]) -> None:
         """Use these microphones of an array from now on; the delay stays, since their calibrated paths share one time origin."""
-        self._mics += [Tape(self._ref.capacity) for _ in range(len(self._mics), max(used) + 1)]
+        self._mics += [DelayBuffer(self._ref.capacity) for _ in range(len(self._mics), max(used) + 1)]
         first, self._used = self._used[0], list(used)
         if self._responses is not None and self._used[0] != first:
             self._meter = DelayMeter(self._responses[self._used[0]])
@@ -117,8 +125,8 @@ class Aligner:
         """Take the next hop (hop,) of microphone and reference, of an array (microphones, hop)."""
         ref = self._announced.reference(ref, self._ref.end)
         heard = np.atleast_2d(mic)
-        for tape, samples in zip(self._mics, heard, strict=True):
-            tape.push(samples)
+        for buffer, samples in zip(self._mics, heard, strict=True):
+            buffer.push(samples)
         mic = heard[self._used[0]]
         self._ref.push(ref)
         started = self._onsets.step(ref)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import expit
 
-from edgefilter.alignment.delay_line import WAIT, Tape
+from edgefilter.alignment.delay_line import WAIT, DelayBuffer
 from edgefilter.alignment.lag_search import CERTAIN, EARLY_ODDS, MOST_LAG_S, NEAR, REFLECTIONS, Found, LagSearch
 from edgefilter.dsp.frames import decibels, stretch
 from edgefilter.dsp.lag import correlation_near, flat_cross, highest
@@ -185,7 +185,11 @@ def _reverberation_db(recording: Samples, reference: Samples, found: Belief) -> 
 
 def _looks(recording: Samples, reference: Samples) -> list[Found]:
     """What looks one after the other at the recording (n,) find in the reference (m,)."""
-    search, mic, ref = LagSearch(2 * REACH, window=LOOK), Tape(REACH + recording.size), Tape(reference.size)
+    search, mic, ref = (
+        LagSearch(2 * REACH, window=LOOK),
+        DelayBuffer(REACH + recording.size),
+        DelayBuffer(reference.size),
+    )
     mic.push(np.zeros(REACH, np.float32))  # a lag of -REACH is none then
     mic.push(recording)
     ref.push(reference)

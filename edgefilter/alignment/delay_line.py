@@ -45,7 +45,7 @@ class Aligned(NamedTuple):
     wait: int = 0
 
 
-class Tape:
+class DelayBuffer:
     """The last `capacity` samples of a stream, addressed by the sample counter; samples that never were are zero."""
 
     def __init__(self, capacity: int) -> None:
@@ -95,8 +95,8 @@ def _kernels(*delays: float) -> Array:
     return np.array(filters)
 
 
-def read_delayed(tape: Tape, stop: int, count: int, delay_from: float, delay_to: float) -> Samples:
-    """The tape at the positions stop - count to stop - 1, less a delay that moves, (count,) float32.
+def read_delayed(buffer: DelayBuffer, stop: int, count: int, delay_from: float, delay_to: float) -> Samples:
+    """The buffer at the positions stop - count to stop - 1, less a delay that moves, (count,) float32.
 
     The delay is delay_from just before the first sample and delay_to, less than 1 away, at the last one. Filters for the two
     ends and the middle are applied to the whole stretch and interpolated by a parabola, which for a stretch of 256 samples
@@ -104,7 +104,7 @@ def read_delayed(tape: Tape, stop: int, count: int, delay_from: float, delay_to:
     """
     middle = 0.5 * (delay_from + delay_to)
     whole = math.floor(middle)
-    source = tape.read(stop - count - whole - HALF_WIDTH, stop - whole + HALF_WIDTH - 1)
+    source = buffer.read(stop - count - whole - HALF_WIDTH, stop - whole + HALF_WIDTH - 1)
     shifted = np.ndarray((2 * HALF_WIDTH, count), np.float32, source, 0, 2 * source.strides)
     filtered = _kernels(delay_from - whole, middle - whole, delay_to - whole).dot(shifted)
     filtered *= _parabola(count)
@@ -118,12 +118,12 @@ def _parabola(count: int) -> Array:
     return np.stack(((2 * u - 1) * (u - 1), 4 * u * (1 - u), u * (2 * u - 1)))
 
 
-def read_line(tape: Tape, stop: int, count: int, delay: float, slope: float, chunk: int = 256) -> Samples:
+def read_line(buffer: DelayBuffer, stop: int, count: int, delay: float, slope: float, chunk: int = 256) -> Samples:
     """As read_delayed for any count, with a delay that is `delay` at the last sample and grows by slope per sample."""
     pieces = []
     for start in range(0, count, chunk):
         size = min(chunk, count - start)
         end = stop - count + start + size
         to = delay - slope * (stop - end)
-        pieces.append(read_delayed(tape, end, size, max(to - slope * size, 0.0), max(to, 0.0)))
+        pieces.append(read_delayed(buffer, end, size, max(to - slope * size, 0.0), max(to, 0.0)))
     return np.concatenate(pieces) if pieces else np.zeros(0, np.float32)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from edgefilter.alignment.delay_line import Tape
+from edgefilter.alignment.delay_line import DelayBuffer
 from edgefilter.alignment.lag_search import NEAR
 from edgefilter.alignment.utterances import FLOOR
 from edgefilter.dsp import fourier
@@ -41,8 +41,8 @@ FORGET = 0.7
 HEARD = 6.0
 """Strength of a look's peak over the rms of +-REACH lags from which it counts."""
 FAINT, STRANGE, EDGE = 0.25, 10.0, 64
-"""Power over what the robot brings below which and above which it is not the robot that is heard, so that no jump can
-be seen, and samples at the edge of the looks' reach at which none is believed."""
+"""Lower and upper limit of the microphone's power over the expected echo's, outside of which no jump can be measured, and samples
+at each end of the range in which none is believed."""
 DRIFTED = 1.5
 """Samples of a sudden error up to which it is put down to the drift: buffers that are lost or repeated have more."""
 EXPECTED, UNEXPECTED, TINY = 3.0, 5.0, 0.3
@@ -114,7 +114,9 @@ class DelayMeter:
         self._confirmed: float | None = None
         self.response = self._prior
 
-    def measure(self, mic: Tape, ref: Tape, now: int, delay: float, slope: float, far: bool) -> DelayMeasurement | None:
+    def measure(
+        self, mic: DelayBuffer, ref: DelayBuffer, now: int, delay: float, slope: float, far: bool
+    ) -> DelayMeasurement | None:
         """Compare the last FRAME samples of mic with the reference at the expected delay; None where either is silent.
 
         far: look at 2 REACH further lags on each side as well.
@@ -171,7 +173,7 @@ class DelayMeter:
             gain_there=energy / (float(there.dot(there)) + 1e-30),
         )
 
-    def _reference(self, ref: Tape, start: int, slope: float, out: Samples) -> Samples:
+    def _reference(self, ref: DelayBuffer, start: int, slope: float, out: Samples) -> Samples:
         """SIZE samples of the reference from start on, the drift about their middle undone by the first term of a Taylor series."""
         x = ref.read(start - 2, start + SIZE + 2)
         np.subtract(x[3:-1], x[1:-3], out=out)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import fft
 
-from edgefilter.alignment.delay_line import WAIT, Tape
+from edgefilter.alignment.delay_line import WAIT, DelayBuffer
 from edgefilter.alignment.utterances import Playback
 from edgefilter.dsp.frames import rise
 from edgefilter.dsp.lag import LOWEST_HZ, flattened
@@ -101,7 +101,7 @@ class LagSearch:
         sizes = (self.span, self._short, WINDOW + 2 * ASIDE)
         self._phases = {size: [_phase(one, size) for one in responses or ()] for size in sizes}
 
-    def prepare(self, ref: Tape | Playback, now: int, since: int) -> None:
+    def prepare(self, ref: DelayBuffer | Playback, now: int, since: int) -> None:
         """Read the reference from sample counter `since` to `now` and transform it, for `listen` to correlate with."""
         self._size = size = self._short if now - since <= self._short - self._early - self._window else self.span
         self._lags = self._early + min(self._max_lag, size - self._early - self._window)
@@ -116,7 +116,7 @@ class LagSearch:
         self._reference = flattened(fft.rfft(r), 1e-5)
         self._prepared, self._since = now, since
 
-    def listen(self, mics: Mapping[int, Tape], now: int, since: int) -> None:
+    def listen(self, mics: Mapping[int, DelayBuffer], now: int, since: int) -> None:
         """Take the microphones up to now, but none of it before since; at most a window after `prepare`.
 
         mics: by number, where the responses are known several; their evidence is summed.
@@ -166,7 +166,7 @@ class LagSearch:
         second = max(earlier, REFLECTED * score[at + NEAR : at + REFLECTIONS].max(initial=0.0), later)
         return Found(lag, float(score[at]) / max(float(second), 1e-12), self._at, heard)
 
-    def before(self, number: int, mic: Tape, ref: Tape | Playback, found: Found) -> bool:
+    def before(self, number: int, mic: DelayBuffer, ref: DelayBuffer | Playback, found: Found) -> bool:
         """Whether a microphone's window BETWEEN samples before the one that the lag was found in shows it as well."""
         stop = found.at - WINDOW - BETWEEN
         x = np.zeros(WINDOW + 2 * ASIDE, np.float32)

@@ -7,7 +7,7 @@ from collections import deque
 import numpy as np
 from scipy import fft
 
-from edgefilter.alignment.delay_line import Aligned, Tape
+from edgefilter.alignment.delay_line import Aligned, DelayBuffer
 from edgefilter.alignment.utterances import OnsetDetector
 from edgefilter.types import SAMPLE_RATE, AlignmentState, AlignmentStats, Samples
 
@@ -39,7 +39,7 @@ class PaperAligner:
     def reset(self) -> None:
         """Forget everything."""
         length = self._max_lag + TEMPLATE + 4 * SAMPLE_RATE
-        self._mic, self._ref = Tape(length), Tape(length)
+        self._mic, self._ref = DelayBuffer(length), DelayBuffer(length)
         self._onsets = OnsetDetector(self.hop)
         self._waiting: deque[int] = deque(maxlen=16)
         self._delay: int | None = None

@@ -36,10 +36,10 @@ LOUD, EXPLAINED = 0.05, 100.0
 13 dB softer. Microphone power, over that of the echo at the present delay, from which on this delay is not the right one;
 single sounds pass a room up to 10 dB better than speech does."""
 LONGEST = SAMPLE_RATE // 4
-"""Samples for which that is believed at most once the robot was heard: a human as loud who begins with it loses no more. As
-long is a reference that has risen out of digital silence taken for a voice's before it has varied."""
+"""Longest muting, samples, once the robot has been heard: it limits what a human as loud as the robot can lose. A reference that
+rises out of digital silence counts as a voice for as long, before its level has varied."""
 USUAL = 1e-2
-"""Mean square that a voice's loudest hop is taken to have at first, -20 dB: a soft first sound makes nobody else loud."""
+"""Initial peak of a voice, mean square, -20 dB: so that a soft onset does not lower the threshold."""
 LEARNING = 0.1
 """Share of a loud hop in the running gain from the reference to the microphone."""
 
@@ -117,7 +117,7 @@ class OnsetDetector:
 
 @dataclass(frozen=True, slots=True)
 class Playback:
-    """An utterance whose first sample lies at position start; it can be read like a tape."""
+    """An utterance whose first sample lies at position start; it can be read like a buffer."""
 
     utterance: Samples
     start: int

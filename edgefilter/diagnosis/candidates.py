@@ -80,5 +80,7 @@ def _fate(entry: Tried, found: Found, named: Collection[str]) -> tuple[Fate, str
     if not named:
         return "explains too little", "for it to be what happened"
     beside = entry.beside
-    added = f"beside what is named it adds {beside.gain_db:.2f} dB" if beside else "what is named leaves it nothing"
+    added = (
+        f"beside what is named it adds {beside.gain_db:.2f} dB" if beside else "beside what is named it adds nothing"
+    )
     return "explained by another", added

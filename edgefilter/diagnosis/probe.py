@@ -46,7 +46,7 @@ NONE = 100.0
 """Times the variance that the best explanation expects: with so much more nothing is known. By the likelihood that is
 nearer from ten times the expected power on. Chosen by hand, not tuned."""
 TWINS = 1e-5
-"""Part of the voice's power (-50 dB) by which two explanations differ, to be two: the fan hides what is less."""
+"""Least difference of two explanations, as a share of the voice's power (-50 dB): the fan hides less."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Samples
 
 PROMISE_DB = 0.5
-"""What is written may leave so much more than the diagnosis did, as it says, before it is asked why: intervals are as wide."""
+"""Rise of the excess, dB, over what the diagnosis left, that the refit to all of the recording may bring: intervals are as wide."""
 
 
 class Added(NamedTuple):
@@ -338,7 +338,7 @@ def add(
     Clocks that drift, jumps and a turned volume are followed by the running filter itself and would spoil the fit of
     anything else, so they are taken out of the recording first, unless they are among the names; the profile does not
     get them. Each effect is fitted with the others in place, in turn, until the error no longer falls, and to all of the
-    recording: that predicts other recordings of the robot better than the fit to half of it by on which `diagnose` tests.
+    recording: `diagnose` fits to half of it and tests on the other, which predicts other recordings of the robot less well.
     So the comparison after is of samples that the fit has used; `prove` says what the effects are worth on others. An event
     (a jump, a moment's move) is kept with the recording in which it happened: of any other the profile predicts what it
     did before.

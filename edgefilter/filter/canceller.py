@@ -46,8 +46,8 @@ PRODUCT_PARTITIONS, PRODUCT_VARIANCE = 2, 2e-3
 VOLUME_REOPENS = 0.02
 """Added to the variance of a path when its volume is found to be turned, relative to its power: the factor is not exact."""
 REOPEN = 0.3
-"""Variance, relative to its power, of a path that is found to be another one. Of the path itself as much is kept as is
-heard: kept whole, a variance that grows with it let it grow without end."""
+"""Variance, relative to its power, of a path that is found to be another one. The weights are shrunk to the echo that
+is heard first: otherwise weights and variance raise each other and diverge."""
 AGED_ROWS = 4
 """Partitions whose process noise is worked out anew in a hop, in turn: a path's power changes slowly."""
 
@@ -275,7 +275,7 @@ class Canceller:
         return echo
 
     def tell_by(self, microphone: int) -> None:
-        """Tell volume and echo in that microphone from now on; the path begins anew: a broken one has scaled the others, too."""
+        """Track the gain in this microphone from now on, and begin the path anew, which the other's gain has scaled."""
         if microphone != self._teller:
             self._teller = microphone
             self._begin()

@@ -110,7 +110,7 @@ class FilteredHop(NamedTuple):
     delay: float
 
 
-class Lesson(NamedTuple):
+class PathUpdate(NamedTuple):
     """A path that predicts better, to be taken over: "learned", or "unlearned" where an earlier one comes back; detail: in words."""
 
     path: PathState
@@ -125,8 +125,8 @@ class Learner(Protocol):
         """A stream begins with that path, in steps of hop samples."""
         ...
 
-    def observe(self, hop: FilteredHop) -> Lesson | None:
-        """Take one hop; the lesson is adopted with the next one."""
+    def observe(self, hop: FilteredHop) -> PathUpdate | None:
+        """Take one hop; the update is adopted with the next one."""
         ...
 
     def stats(self) -> dict[str, object]:

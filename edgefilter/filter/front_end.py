@@ -12,7 +12,7 @@ from edgefilter.dsp.stft import Analyser
 from edgefilter.echo.running import SourceChain
 from edgefilter.engines.base import ClipEngine, Engine
 from edgefilter.filter.canceller import Canceller, CancellerOutput
-from edgefilter.filter.echo_path import PAST, EchoPath, FilteredHop, Learner, Lesson, starting_path
+from edgefilter.filter.echo_path import PAST, EchoPath, FilteredHop, Learner, PathUpdate, starting_path
 from edgefilter.filter.hum import Hum
 from edgefilter.filter.microphones import Microphones
 from edgefilter.filter.removal import Removal
@@ -51,12 +51,12 @@ class Centred:
 class LinearStage:
     """Tracked delay, echo path and residual echo: what only front ends of the kind "full" have.
 
-    learner: told of every hop; the lesson that it answers is adopted with the next one. lesson: adopted in the latest hop.
+    learner: told of every hop; the update that it answers is adopted with the next one. update: adopted in the latest hop.
     removal: how much of the robot is removed.
     """
 
-    lesson: Lesson | None = None
-    _next: Lesson | None = None
+    update: PathUpdate | None = None
+    _next: PathUpdate | None = None
     _latest: FilteredHop | None = None
 
     def __init__(self, aligner: Aligner, path: EchoPath, residual: Residual, learner: Learner | None = None) -> None:
@@ -79,9 +79,9 @@ class LinearStage:
         located = aligned.state not in UNLOCATED
         past = self._past() if aligned.realigned else None
         output = self.path.step(mic, aligned.reference, located, past)
-        self.lesson, self._next = self._next, None
-        if self.lesson:
-            output = self._adopt(self.lesson, mic, aligned.reference, located, output)
+        self.update, self._next = self._next, None
+        if self.update:
+            output = self._adopt(self.update, mic, aligned.reference, located, output)
         if self._learner:
             idle = aligned.state == "idle"
             self._latest = FilteredHop(mic, aligned.reference, output.innovation, located, idle, past, aligned.delay)
@@ -97,10 +97,10 @@ class LinearStage:
             self._next = self._learner.observe(self._latest)
 
     def _adopt(
-        self, lesson: Lesson, mic: Samples, reference: Samples, located: bool, before: CancellerOutput
+        self, update: PathUpdate, mic: Samples, reference: Samples, located: bool, before: CancellerOutput
     ) -> CancellerOutput:
         """Fade from this hop's output of the old path (before) to that of the learned path."""
-        self.path = EchoPath.resumed(lesson.path, self._past(), reference.size)
+        self.path = EchoPath.resumed(update.path, self._past(), reference.size)
         after = self.path.step(mic, reference, located)
         echo = before.echo + self._fade * (after.echo - before.echo)
         return CancellerOutput(echo, mic - echo, after.uncertainty, after.innovation)
@@ -242,7 +242,7 @@ class FrontEnd:
         self.spatial.learn(self.errors, gain, probability, speaking, frame.idle)
 
     def _added(self, source: SourceChain) -> Samples | None:
-        """Expected power of the effects that no waveform predicts, for the path in use, (bins,); a lesson can change it."""
+        """Expected power of the effects that no waveform predicts, for the path in use, (bins,); a update can change it."""
         if source is not self._source:
             self._source = source
             self._unpredictable = Unpredictable(self._stft, source.colours) if source.colours else None

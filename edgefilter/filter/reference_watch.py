@@ -12,7 +12,7 @@ import numpy as np
 
 from edgefilter.alignment.aligner import LIKELY_LAG_S
 from edgefilter.alignment.belief import believed
-from edgefilter.alignment.delay_line import Aligned, Tape
+from edgefilter.alignment.delay_line import Aligned, DelayBuffer
 from edgefilter.alignment.lag_search import CERTAIN, EVEN, Found, LagSearch
 from edgefilter.alignment.utterances import FLOOR, VARIES, OnsetDetector, Sustained
 from edgefilter.dsp import fourier
@@ -64,7 +64,7 @@ class ReferenceWatch:
     def __init__(self, hop: int, bins: int) -> None:
         self._hop = hop
         self._search = LagSearch(round(LIKELY_LAG_S * SAMPLE_RATE), early=LATEST, window=2 * LATEST)
-        self._mic, self._ref = (Tape(self._search.span + LENGTH) for _ in range(2))
+        self._mic, self._ref = (DelayBuffer(self._search.span + LENGTH) for _ in range(2))
         self._onsets = OnsetDetector(hop)
         self.verdict: Verdict = "unknown"
         self.without = self.same = False

@@ -218,8 +218,8 @@ class Stream:
             speaking = self.barge_in.speaking
             for kind, detail in self._watch.step(self.front.heard, ref, aligned, frame, stage.removal, speaking):
                 self._tell(kind, detail)
-            if stage.lesson:
-                self._tell(stage.lesson.kind, stage.lesson.detail)
+            if stage.update:
+                self._tell(stage.update.kind, stage.update.detail)
         engine = self.engine
         if engine.lookahead is None:
             self._collect(frame, engine)

@@ -15,7 +15,7 @@ from edgefilter.types import SAMPLE_RATE, Samples
 MEMORY = 0.8
 """Weight of the past in the smoothed moments, per hop of 16 ms: about 80 ms."""
 EXCESS = 1.5
-"""Power of an error, over what another volume leaves or over the microphone, that no filter leaves by being inexact."""
+"""Ratio of the error's power to that of the microphone, or to the error with another volume, above which the gain is wrong."""
 PATIENCE_S = 0.5
 """Seconds in which a suspected volume must be confirmed, and for which none is suspected afterwards; seconds after which
 an echo that is too loud is put down to another path."""

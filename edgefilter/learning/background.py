@@ -1,4 +1,4 @@
-"""Learning in another process: the running filter sends its hops there and takes the lessons that come back."""
+"""Learning in another process: the running filter sends its hops there and takes the updates that come back."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from edgefilter.echo.user_effects import loaded_files
-from edgefilter.filter.echo_path import FilteredHop, Lesson, PathState
+from edgefilter.filter.echo_path import FilteredHop, PathState, PathUpdate
 from edgefilter.learning.history import RECENT_S
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE
@@ -39,11 +39,11 @@ class Beginning(NamedTuple):
 
 
 class News(NamedTuple):
-    """From the learner's process: what it says of itself, and a lesson where there is one."""
+    """From the learner's process: what it says of itself, and a update where there is one."""
 
     stream: int
     stats: dict[str, object]
-    lesson: Lesson | None
+    update: PathUpdate | None
 
 
 class BackgroundLearner:
@@ -58,7 +58,7 @@ class BackgroundLearner:
     -----
     A hop costs the running filter a copy of three arrays; a quarter of a second of them go into a pipe at once, and it
     never waits. Where the other process falls behind by 15 s, it begins anew; where it ends, or cannot be started, the
-    filter goes on without lessons. `stats` tells of both.
+    filter goes on without updates. `stats` tells of both.
 
     Examples
     --------
@@ -71,7 +71,7 @@ class BackgroundLearner:
     def __init__(self, profile: Profile | None = None, remember: Path | None = None) -> None:
         self._profile, self._remember = profile, remember
         self._worker: _Worker | None = None
-        self._lesson: Lesson | None = None
+        self._update: PathUpdate | None = None
         self._stats: dict[str, object] = {}
         self._stream = 0
 
@@ -89,8 +89,8 @@ class BackgroundLearner:
             self._finalizer = weakref.finalize(self, self._worker.end)
             self._begin()
 
-    def observe(self, hop: FilteredHop) -> Lesson | None:
-        """Send hops to the other process, some together, and look whether a lesson has come."""
+    def observe(self, hop: FilteredHop) -> PathUpdate | None:
+        """Send hops to the other process, some together, and look whether a update has come."""
         if self._worker is None:
             return None
         if len(self._worker.unsent) > RECENT_S * SAMPLE_RATE / self._hop:
@@ -100,8 +100,8 @@ class BackgroundLearner:
         self._worker.send(hop)
         if len(self._worker.unsent) >= TOGETHER:
             self._take(self._worker.exchange())
-        lesson, self._lesson = self._lesson, None
-        return lesson
+        update, self._update = self._update, None
+        return update
 
     def stats(self) -> dict[str, object]:
         """What the other process has told of itself, and whether it lives."""
@@ -115,7 +115,7 @@ class BackgroundLearner:
         if self._worker:
             self._finalizer.detach()
             self._take(self._worker.end())
-            self._worker = self._lesson = None
+            self._worker = self._update = None
 
     def _begin(self) -> None:
         assert self._worker is not None
@@ -125,8 +125,8 @@ class BackgroundLearner:
     def _take(self, all_news: list[News]) -> None:
         for news in all_news:
             if news.stream == self._stream:
-                self._stats, self._lesson = news.stats, news.lesson or self._lesson
-                self._path = news.lesson.path if news.lesson else self._path
+                self._stats, self._update = news.stats, news.update or self._update
+                self._path = news.update.path if news.update else self._path
 
 
 class _Worker:

@@ -21,7 +21,7 @@ from edgefilter.echo.measurement import Measurement, whiten
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import ProfileError
 from edgefilter.filter.canceller import COLD, Canceller
-from edgefilter.filter.echo_path import PAST, TAPS, EchoPath, Effects, FilteredHop, Lesson, PathState, starting_path
+from edgefilter.filter.echo_path import PAST, TAPS, EchoPath, Effects, FilteredHop, PathState, PathUpdate, starting_path
 from edgefilter.filter.volume import AUDIBLE, WITNESSES
 from edgefilter.learning.history import MINUTE, RECENT_S, HopHistory, emphasised
 from edgefilter.profile.array import ArrayCalibration
@@ -37,14 +37,14 @@ TIMES = 3
 """As little as RECENT_S teaches more where it is replayed several times."""
 BEFORE = "the path of before"
 BLOCKS = 8, 60
-"""Of WITNESSES hops each, whose errors are compared as one: after so many a rival can win, and is given up."""
+"""Of WITNESSES hops each, whose errors are compared as one: after so many a candidate can win, and is given up."""
 GAIN_DB, CERTAIN = 0.15, 2.5
-"""Mean fall of the error by which a rival wins, and how many of its standard errors that must be: a human adds the same error
+"""Mean fall of the error by which a candidate wins, and how many of its standard errors that must be: a human adds the same error
 to both."""
 
 
 @dataclass
-class Rival:
+class CandidatePath:
     """A path that is compared, hop by hop, with the one in use.
 
     was: what to call it. kind: of the event where it wins. stays: whether it is a standing one, compared by its latest
@@ -101,7 +101,7 @@ class Rival:
 
 
 class PathLearner:
-    """Learns from every hop that it is given, and answers with a lesson where a better path is found.
+    """Learns from every hop that it is given, and answers with a update where a better path is found.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ class PathLearner:
     Notes
     -----
     It keeps the last minute. Now and then it fits the loudspeaker's effects to it, replays the minute to a new path that
-    has them, and then runs that path beside the one in use. Where it predicts new hops clearly better, it is the lesson;
+    has them, and then runs that path beside the one in use. Where it predicts new hops clearly better, it is the update;
     the path that it replaces runs on, and comes back where it is the better one again. The same recording teaches the same.
 
     Examples
@@ -138,29 +138,31 @@ class PathLearner:
         self._history, self._running = HopHistory(hop), self._resumed(path)
         known = path.canceller.weights.any()
         self._response = self._running.canceller.impulse_response() if known else None
-        self._rivals = [Rival(self._running, "no lesson at all", "unlearned", stays=True)]
+        self._compared = [CandidatePath(self._running, "the path before any learning", "unlearned", stays=True)]
         if known:
-            self._rivals.append(Rival(self._fresh((), None, products=False), "a path from nothing", stays=True))
+            self._compared.append(
+                CandidatePath(self._fresh((), None, products=False), "a path from nothing", stays=True)
+            )
         self._audible_s, self._next_s, self._peak, self._sustained = 0.0, FIRST_S, 0.0, Sustained()
         self._snapshot = None
         self._counts = dict.fromkeys(self._counts, 0)
 
-    def observe(self, hop: FilteredHop) -> Lesson | None:
+    def observe(self, hop: FilteredHop) -> PathUpdate | None:
         """Take one hop; compare, and now and then fit."""
         audible = self._audible(hop)
         self._history.append(hop, audible)
         self._running.step(hop.mic, hop.reference, hop.located, hop.past)
         left = emphasised(hop.innovation)
-        for rival in self._rivals:
-            if rival.path is not self._running:
-                rival.step(hop, left, audible)
-        won = [rival for rival in self._rivals if rival.won]
+        for candidate in self._compared:
+            if candidate.path is not self._running:
+                candidate.step(hop, left, audible)
+        won = [candidate for candidate in self._compared if candidate.won]
         if won:
-            return self._adopt(max(won, key=lambda rival: rival.gain_db))
-        self._rivals = [rival for rival in self._rivals if not rival.over]
+            return self._adopt(max(won, key=lambda candidate: candidate.gain_db))
+        self._compared = [candidate for candidate in self._compared if not candidate.over]
         if audible and self._audible_s >= self._next_s:
             self._next_s = min(self._next_s * FACTOR, self._next_s + MINUTE)
-            self._rivals = [rival for rival in self._rivals if rival.stays] + self._candidates()
+            self._compared = [candidate for candidate in self._compared if candidate.stays] + self._candidates()
             with suppress(ProfileError):  # it is tried again, and told of, at the end; the sound goes on
                 self._keep()
             self._snapshot = self._running.state(), self._history.count
@@ -181,35 +183,35 @@ class PathLearner:
         self._audible_s += audible * self._hop / SAMPLE_RATE
         return audible
 
-    def _adopt(self, winner: Rival) -> Lesson:
+    def _adopt(self, winner: CandidatePath) -> PathUpdate:
         self._counts[winner.kind] += 1
         self._next_s = min(self._next_s, self._audible_s + RECENT_S)
         detail = f"{winner.was}: {winner.gain_db:.1f} dB less is left of the robot"
-        self._rivals = [rival for rival in self._rivals if rival.stays and rival.was != BEFORE]
-        for rival in self._rivals:
-            rival.restart()
-        if all(rival.path is not self._running for rival in self._rivals):
-            self._rivals.append(Rival(self._running, BEFORE, "unlearned", stays=True))
+        self._compared = [candidate for candidate in self._compared if candidate.stays and candidate.was != BEFORE]
+        for candidate in self._compared:
+            candidate.restart()
+        if all(candidate.path is not self._running for candidate in self._compared):
+            self._compared.append(CandidatePath(self._running, BEFORE, "unlearned", stays=True))
         self._running = winner.path
-        return Lesson(winner.path.state(), winner.kind, detail)
+        return PathUpdate(winner.path.state(), winner.kind, detail)
 
-    def _candidates(self) -> list[Rival]:
+    def _candidates(self) -> list[CandidatePath]:
         """Paths that know the minute, with its loudspeaker and without; and one from nothing: the robot may stand elsewhere."""
         self._counts["rounds"] += 1
         known, fitted = self._begin.effects, self._fitted()
         short = self._audible_s < RECENT_S
-        rivals = [Rival(self._fresh(known, self._response), "path")]
+        candidates = [CandidatePath(self._fresh(known, self._response), "path")]
         if any(find(name).learned for name, _ in fitted):
-            rivals.append(Rival(self._fresh(fitted, self._response), "loudspeaker and path"))
-        for rival in rivals:
+            candidates.append(CandidatePath(self._fresh(fitted, self._response), "loudspeaker and path"))
+        for candidate in candidates:
             for _ in range(TIMES if short else 1):
-                self._history.replay(rival.path)
+                self._history.replay(candidate.path)
         if self._response is not None or not short:
             elsewhere, recent = self._fresh(fitted, None), self._history.recent()
             for _ in range(TIMES):
                 recent.replay(elsewhere)
-            rivals.append(Rival(elsewhere, "another path"))
-        return rivals
+            candidates.append(CandidatePath(elsewhere, "another path"))
+        return candidates
 
     def _fitted(self) -> Effects:
         """The effects of the beginning, those that can be learned as they explain the newest seconds."""
@@ -248,11 +250,11 @@ class PathLearner:
         learned = learned_profile(self._profile, self._resumed(state), self._history)
         microphones = self._running.canceller.microphones
         before = starting_path(self._profile, self._hop, microphones)
-        rival = Rival(starting_path(learned, self._hop, microphones), "what was learned")
+        candidate = CandidatePath(starting_path(learned, self._hop, microphones), "what was learned")
         for hop, audible in self._history.since(count):
             left = emphasised(before.step(hop.mic, hop.reference, hop.located, hop.past).innovation)
-            rival.step(hop, left, audible)
-        if rival.won:
+            candidate.step(hop, left, audible)
+        if candidate.won:
             learned.save(self._remember)
             self._counts["remembered"] += 1
 

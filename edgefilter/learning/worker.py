@@ -1,4 +1,4 @@
-"""The learner's process: hops from standard input through a PathLearner, lessons to standard output (see background.py)."""
+"""The learner's process: hops from standard input through a PathLearner, updates to standard output (see background.py)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import time
 from typing import BinaryIO
 
 from edgefilter.echo.user_effects import load_effect
-from edgefilter.filter.echo_path import Lesson
+from edgefilter.filter.echo_path import PathUpdate
 from edgefilter.filter.timing import peak_memory_mb
 from edgefilter.learning.background import LENGTH, TOGETHER, Beginning, News
 from edgefilter.learning.path_learner import PathLearner
@@ -34,9 +34,9 @@ def learn(answers: BinaryIO) -> None:
     """Take each message as it comes; at the end keep what is to be remembered."""
     learner, stream, hops = PathLearner(), 0, 0
 
-    def tell(lesson: Lesson | None = None) -> None:
+    def tell(update: PathUpdate | None = None) -> None:
         used = {"cpu_s": round(time.process_time(), 2), "memory_mb": peak_memory_mb(), "hops": hops}
-        data = pickle.dumps(News(stream, {**learner.stats(), **used}, lesson), protocol=5)
+        data = pickle.dumps(News(stream, {**learner.stats(), **used}, update), protocol=5)
         answers.write(LENGTH.pack(len(data)) + data)
         answers.flush()
 
@@ -51,9 +51,9 @@ def learn(answers: BinaryIO) -> None:
             learner, stream, hops = PathLearner(message.profile, message.remember), message.stream, 0
             learner.start(message.path, message.hop)
             continue
-        lesson = learner.observe(message)
+        update = learner.observe(message)
         hops += 1
-        if lesson or hops % TOGETHER == 0:
-            tell(lesson)
+        if update or hops % TOGETHER == 0:
+            tell(update)
     learner.close()
     tell()

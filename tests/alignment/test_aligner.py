@@ -7,7 +7,7 @@ import pytest
 from scipy import signal
 
 from edgefilter.alignment.aligner import Aligner
-from edgefilter.alignment.delay_line import Tape, read_delayed, read_line
+from edgefilter.alignment.delay_line import DelayBuffer, read_delayed, read_line
 from edgefilter.alignment.delay_tracker import DelayMeasurement, JumpWitness
 from edgefilter.alignment.lag_search import Found, LagSearch
 from edgefilter.alignment.paper import PaperAligner
@@ -250,7 +250,7 @@ def test_no_step_of_a_search_comes_twice_in_a_hop(monkeypatch):
 def test_hard_cuts_of_two_windows_are_no_lag():
     worst = 0.0
     for seed in range(12):
-        mic, ref = Tape(50000), Tape(50000)
+        mic, ref = DelayBuffer(50000), DelayBuffer(50000)
         rumble = signal.lfilter([1.0], np.poly([0.995, 0.995]), np.random.default_rng(seed).standard_normal((2, 20000)))
         mic.push((rumble[0] / np.std(rumble)).astype(np.float32))
         ref.push((rumble[1] / np.std(rumble)).astype(np.float32))
@@ -331,13 +331,13 @@ def test_paper_aligner_decides_every_utterance(hop):
 
 
 def test_a_delay_line_delays_a_sine_by_a_moving_fraction():
-    tape, n = Tape(8000), np.arange(10000)
+    tape, n = DelayBuffer(8000), np.arange(10000)
     for frequency, allowed in (
         (1000, 1e-4),
         (5000, 3e-4),
         (6500, 3e-3),
     ):  # float32 and the window's transition band at 7-8 kHz
-        tape = Tape(8000)
+        tape = DelayBuffer(8000)
         for at in range(0, 10000, 250):
             tape.push(np.sin(2 * np.pi * frequency / RATE * n[at : at + 250]).astype(np.float32))
         got = read_delayed(tape, 9500, 256, 1000.3, 1000.377)
@@ -348,7 +348,7 @@ def test_a_delay_line_delays_a_sine_by_a_moving_fraction():
 
 
 def test_a_tape_is_silent_outside_what_it_holds():
-    tape = Tape(100)
+    tape = DelayBuffer(100)
     tape.push(np.ones(60, np.float32))
     assert tape.read(-10, 70).tolist() == [0.0] * 10 + [1.0] * 60 + [0.0] * 10
     tape.push(np.full(60, 2, np.float32))
@@ -357,7 +357,7 @@ def test_a_tape_is_silent_outside_what_it_holds():
 
 @pytest.mark.parametrize("known", [1, 128, 300])
 def test_a_reference_shorter_than_its_fades_is_searched_too(known):
-    search, tape = LagSearch(24_000), Tape(60_000)
+    search, tape = LagSearch(24_000), DelayBuffer(60_000)
     tape.push(np.random.default_rng(known).standard_normal(60_000).astype(np.float32))
     search.prepare(tape, 60_000, 60_000 - known)
     search.listen({0: tape}, 60_000, 60_000 - known)

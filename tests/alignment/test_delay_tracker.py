@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edgefilter.alignment.delay_line import Tape
+from edgefilter.alignment.delay_line import DelayBuffer
 from edgefilter.alignment.delay_tracker import FRAME, STRIDE, DelayMeasurement, DelayMeter, DriftFilter, JumpWitness
 
 
@@ -191,7 +191,7 @@ def test_a_look_finds_how_far_the_delay_is_off_and_whether_another_place_is_the_
     """Of noise and its echo, as late by 500 samples and the error."""
     rng = np.random.default_rng(3)
     sound = (0.1 * level * rng.standard_normal(32_000)).astype(np.float32)
-    mic, ref = Tape(32_000), Tape(32_000)
+    mic, ref = DelayBuffer(32_000), DelayBuffer(32_000)
     ref.push(sound)
     mic.push(np.roll(sound, 500 + round(error)))
     found = DelayMeter().measure(mic, ref, 30_000, 500.0, 0.0, far)

@@ -12,7 +12,7 @@ from edgefilter.alignment.delay_line import WAIT
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.linear import Linear
 from edgefilter.filter.budget import DEMO
-from edgefilter.filter.echo_path import Lesson, PathState
+from edgefilter.filter.echo_path import PathState, PathUpdate
 from edgefilter.filter.front_end import RUMBLE, FrontEnd
 from edgefilter.filter.residual_echo import Residual
 from edgefilter.types import SAMPLE_RATE
@@ -89,11 +89,11 @@ class Forgetting:
 
     def start(self, path, hop):
         nothing = replace(path.canceller, weights=0 * path.canceller.weights)
-        self.lesson = Lesson(PathState(path.effects, nothing), "learned", "nothing")
+        self.update = PathUpdate(PathState(path.effects, nothing), "learned", "nothing")
 
     def observe(self, hop):
         self.hops += 1
-        return self.lesson if self.hops == 20 else None
+        return self.update if self.hops == 20 else None
 
 
 def test_a_lesson_is_faded_in_over_the_hop_in_which_it_is_adopted():
@@ -104,7 +104,7 @@ def test_a_lesson_is_faded_in_over_the_hop_in_which_it_is_adopted():
         for front in (plain, taught):
             front.step(*hop)
             front.linear_stage.learn()
-        if taught.linear_stage.lesson:
+        if taught.linear_stage.update:
             break
         np.testing.assert_allclose(taught.linear.echo, plain.linear.echo, atol=1e-6)  # the past is read in other pieces
     assert np.abs(plain.linear.echo).max() > 0.05

@@ -1,4 +1,4 @@
-"""Learning in another process: the same lessons, late, and a filter that does without them where it must."""
+"""Learning in another process: the same updates, late, and a filter that does without them where it must."""
 
 import gc
 import os

@@ -1,38 +1,38 @@
-"""A rival takes over only on clear evidence."""
+"""A candidate takes over only on clear evidence."""
 
 import numpy as np
 
-from edgefilter.learning.path_learner import BLOCKS, Rival
+from edgefilter.learning.path_learner import BLOCKS, CandidatePath
 
 LEAST, MOST = BLOCKS
 
 
-def rival(gains):
-    return Rival(None, "a test", gains_db=list(gains))
+def candidate(gains):
+    return CandidatePath(None, "a test", gains_db=list(gains))
 
 
 def test_a_clear_and_steady_gain_wins():
-    assert rival([0.5, 0.6] * LEAST).won
+    assert candidate([0.5, 0.6] * LEAST).won
 
 
 def test_nothing_is_said_of_a_rival_without_a_comparison():
-    assert not rival([]).won and not rival([]).over
+    assert not candidate([]).won and not candidate([]).over
 
 
 def test_few_blocks_small_gains_and_scattered_ones_do_not():
-    assert not rival([1.0] * (LEAST - 1)).won
-    assert not rival([0.1, 0.12] * LEAST).won
-    assert not rival([6.0, -5.0] * LEAST).won
+    assert not candidate([1.0] * (LEAST - 1)).won
+    assert not candidate([0.1, 0.12] * LEAST).won
+    assert not candidate([6.0, -5.0] * LEAST).won
 
 
 def test_a_loss_never_wins_and_ends():
-    lost = rival(np.full(MOST, -0.5))
+    lost = candidate(np.full(MOST, -0.5))
     assert not lost.won
     assert lost.over
 
 
 def test_a_standing_rival_is_scored_by_its_latest_blocks_and_never_given_up():
-    standing = Rival(None, "a test", stays=True, gains_db=[-1.0] * MOST)
+    standing = CandidatePath(None, "a test", stays=True, gains_db=[-1.0] * MOST)
     assert not standing.over
     standing.gains_db = [0.4, 0.5] * LEAST
     assert standing.won

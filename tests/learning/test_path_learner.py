@@ -5,7 +5,7 @@ import pytest
 
 from edgefilter import EgoFilter, PathLearner, Profile, ProfileError, enhance
 from edgefilter.filter.echo_path import starting_path
-from edgefilter.learning.path_learner import Rival
+from edgefilter.learning.path_learner import CandidatePath
 from edgefilter.types import SAMPLE_RATE
 from tests.learning.scenes import Scene
 
@@ -61,8 +61,8 @@ def test_the_first_lesson_knows_the_loudspeaker(alone):
     """After two seconds of the robot, some of which the search for its lag has cost."""
     ego = EgoFilter(engine="linear", learn=PathLearner())
     ego.process(alone.mic[: 4 * SAMPLE_RATE], alone.reference[: 4 * SAMPLE_RATE])
-    lessons = [event.detail for event in ego.events() if event.kind == "learned"]
-    assert lessons and lessons[0].startswith("loudspeaker and path: ")
+    updates = [event.detail for event in ego.events() if event.kind == "learned"]
+    assert updates and updates[0].startswith("loudspeaker and path: ")
 
 
 @pytest.mark.slow
@@ -136,15 +136,18 @@ def test_before_a_stream_begins_nothing_was_tried_and_nothing_learned():
 
 
 def test_however_often_a_path_is_taken_over_only_a_few_run_beside_the_one_in_use():
-    """A robot that is carried about all day has a lesson each time; each path that runs beside costs as much as the filter."""
+    """A robot that is carried about all day has a update each time; each path that runs beside costs as much as the filter."""
     learner = PathLearner()
     learner.start(starting_path(None, 256).state(), 256)
     for _ in range(5):
-        learner._rivals += [Rival(starting_path(None, 256), "path"), Rival(starting_path(None, 256), "another path")]
-        learner._adopt(learner._rivals[-1])
-        assert [rival.was for rival in learner._rivals] in (
-            ["no lesson at all"],
-            ["no lesson at all", "the path of before"],
+        learner._compared += [
+            CandidatePath(starting_path(None, 256), "path"),
+            CandidatePath(starting_path(None, 256), "another path"),
+        ]
+        learner._adopt(learner._compared[-1])
+        assert [candidate.was for candidate in learner._compared] in (
+            ["the path before any learning"],
+            ["the path before any learning", "the path of before"],
         )
 
 

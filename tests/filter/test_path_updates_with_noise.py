@@ -1,4 +1,4 @@
-"""A lesson may bring a path whose effects add noise of their own, or take them away, while the filter runs."""
+"""A update may bring a path whose effects add noise of their own, or take them away, while the filter runs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import edgefilter
 from edgefilter import Profile
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.engines.spectral_subtraction import SpectralSubtraction
-from edgefilter.filter.echo_path import FilteredHop, Lesson, PathState
+from edgefilter.filter.echo_path import FilteredHop, PathState, PathUpdate
 from edgefilter.filter.stream import Stream
 
 DEMO = Path(edgefilter.__file__).parent / "demo_data"
@@ -40,10 +40,12 @@ class Teacher:
     def start(self, path: PathState, hop: int) -> None:
         self.path = path
 
-    def observe(self, hop: FilteredHop) -> Lesson | None:
+    def observe(self, hop: FilteredHop) -> PathUpdate | None:
         self.hops += 1
         return (
-            Lesson(PathState(self.effects, self.path.canceller), "learned", "another path") if self.hops == 30 else None
+            PathUpdate(PathState(self.effects, self.path.canceller), "learned", "another path")
+            if self.hops == 30
+            else None
         )
 
     def stats(self):
@@ -66,5 +68,5 @@ def test_what_no_waveform_predicts_follows_the_path_in_use(before, after):
     mic = (0.01 * mic + np.pad(profile.echo.predict(ref), (100, 0))[: ref.size]).astype(np.float32)
     out = np.concatenate((stream.process(mic, ref), stream.flush()))
     assert np.isfinite(out).all() and [event.kind for event in stream.events].count("learned") == 1
-    early, late = np.mean(engine.told[10:28]), np.mean(engine.told[40:58])  # the lesson comes with hop 30
+    early, late = np.mean(engine.told[10:28]), np.mean(engine.told[40:58])  # the update comes with hop 30
     assert late > 1e3 * early if after else early > 1e3 * late
