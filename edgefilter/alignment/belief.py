@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.special import expit
@@ -61,28 +62,28 @@ class Belief:
         """The median of the certain lags, samples; None where none is."""
         return int(np.sort(self.certain)[self.certain.size // 2]) if self.certain.size else None
 
-    @property
+    @cached_property
     def steps(self) -> tuple[Array, Array]:
-        """By how many samples the likely lag has changed, each time that it has, and by how many lost buffers may have changed it, (k,) each."""
-        likely = self.probability > 0.5
-        steps, apart = np.diff(self.lags[likely]), np.diff(self.starts[likely])
-        changed = np.abs(steps) > SAME
-        return steps[changed], LOST * np.maximum(apart[changed] / LOOK, 1.0)
-
-    @property
-    def lossy(self) -> float:
-        """The odds that samples are missing in the reference, over those before anything was heard.
+        """By how many samples the likely lag has changed, each time that it has, and the odds that lost buffers did it, (k,) each.
 
         A step is one of lost buffers, or as likely as not any other: then a lag anywhere is as likely.
         """
-        steps, most = self.steps
-        return float(np.prod(0.5 + 0.5 * REACH / most * ((steps > 0) & (steps <= most))))
+        likely = self.probability > 0.5
+        steps, apart = np.diff(self.lags[likely]), np.diff(self.starts[likely])
+        changed = np.abs(steps) > SAME
+        steps, most = steps[changed], LOST * np.maximum(apart[changed] / LOOK, 1.0)
+        return steps, 0.5 + 0.5 * REACH / most * ((steps > 0) & (steps <= most))
+
+    @property
+    def lossy(self) -> float:
+        """The odds that samples are missing in the reference, over those before anything was heard."""
+        return float(np.prod(self.steps[1]))
 
     @property
     def lost(self) -> int:
         """Samples that are missing in the reference, by which the lag has grown; 0 unless that is certain."""
-        steps, most = self.steps
-        return int(steps[(steps > 0) & (steps <= most)].sum()) if EARLY_ODDS * self.lossy > CERTAIN else 0
+        steps, odds = self.steps
+        return int(steps[odds > 0.5].sum()) if EARLY_ODDS * self.lossy > CERTAIN else 0
 
     @property
     def missing(self) -> str:

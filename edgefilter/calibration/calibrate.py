@@ -79,8 +79,7 @@ def calibrate(
     >>> profile.delay, round(float(profile.response[100]), 2)
     (300.0, 0.5)
     """
-    given = (at_16_khz(x, sample_rate) for x in (sweep_reference, sweep_recording, noise_recording))
-    reference, recordings, noises = checked(*given)
+    reference, recordings, noises = checked(sweep_reference, sweep_recording, noise_recording, sample_rate)
     recording, noise = first(recordings), first(noises)
     law = sweep_law(reference)
     check_lengths(law, recording, noise)
@@ -117,8 +116,11 @@ def calibrate(
     )
 
 
-def checked(reference: object, recording: object, noise: object) -> tuple[Samples, Samples, Samples]:
-    """The recordings of a calibration as float32, of an array the latter two (microphones, n); CalibrationError for others."""
+def checked(
+    reference: Samples, recording: Samples, noise: Samples, sample_rate: int
+) -> tuple[Samples, Samples, Samples]:
+    """The recordings of a calibration at 16 kHz as float32, of an array the latter two (microphones, n); CalibrationError for others."""
+    reference, recording, noise = (at_16_khz(x, sample_rate) for x in (reference, recording, noise))
     try:
         found = (
             as_samples(reference, "the sweep reference"),

@@ -26,7 +26,6 @@ from edgefilter.dsp.fractional_delay import interpolate
 from edgefilter.dsp.frames import decibels
 from edgefilter.dsp.lag import correlation_near, highest, top
 from edgefilter.dsp.psd import ROUNDING_PSD, total_power
-from edgefilter.dsp.resample import at_16_khz
 from edgefilter.errors import CalibrationError
 from edgefilter.profile.approximation import CLEARLY_DB, LinearApproximation
 from edgefilter.profile.data import GRID_HZ, Profile
@@ -194,8 +193,7 @@ def calibrate_multisine(
     >>> bool(-30 < even < -20 and odd < -50)
     True
     """
-    given = (at_16_khz(x, sample_rate) for x in (sweep_reference, sweep_recording, noise_recording))
-    reference, recordings, noises = checked(*given)
+    reference, recordings, noises = checked(sweep_reference, sweep_recording, noise_recording, sample_rate)
     recording, noise = first(recordings), first(noises)
     law = multisine_law(reference)
     sweep = reference[: law.first]

@@ -140,10 +140,7 @@ def with_fitted(
 ) -> tuple[Profile, EchoModel, tuple[str, ...]]:
     """Fit these effects to the recording: the profile with them, the fitted model, and the names of straightened effects in it."""
     model, straightened = fit_straight(prepared, names) if names else (prepared.model, ())
-    echo, values = profile.echo, dict(model.effects)
-    for name in names:
-        echo = echo.with_effect(name, values[name])
-    return profile.with_echo(echo), model, straightened
+    return profile.with_echo(profile.echo.with_effects(names, dict(model.effects))), model, straightened
 
 
 def _cut(prediction: Samples, robot: NDArray[np.bool_]) -> int:

@@ -154,9 +154,8 @@ class Recording:
         before, after = self.compare(), Recording(self.mic, self.reference, knowing).compare()
         if not straightened:
             return Added(knowing, before, after)
-        values, straight = dict(model.effects), prepared.model
-        for name in straightened:
-            straight = straight.with_effect(name, values[name])
+        values = dict(model.effects)
+        straight = prepared.model.with_effects(straightened, values)
         told = tuple(f"{name} is taken out first: {find(name).sentence(values[name])}" for name in straightened)
         left = f"{before.excess_db:.1f} dB over the noise floor before, {after.excess_db:.1f} dB after"
         told += (f"with that left in, as compare has it: {left}",)
@@ -182,16 +181,11 @@ class Recording:
             With the findings; of that profile; with its figures, or as it was where not all of its findings are written.
         """
         prepared = self.straightened
-        start, values = prepared.model, dict(found.model.effects)
-        for name in names:
-            start = start.with_effect(name, values[name])
+        start = prepared.model.with_effects(names, dict(found.model.effects))
         everywhere = replace(prepared.measurement, fit=prepared.usable)
         choices: list[tuple[Comparison, Profile]] = []
         for model in (fit_jointly(everywhere, start, names), start):
-            echo, values = self.profile.echo, dict(model.effects)
-            for name in names:
-                echo = echo.with_effect(name, values[name])
-            knowing = self.profile.with_echo(echo)
+            knowing = self.profile.with_echo(self.profile.echo.with_effects(names, dict(model.effects)))
             choices.append((Recording(self.mic, self.reference, knowing).compare(), knowing))
             if choices[-1][0].excess_db <= found.remaining_db + PROMISE_DB:
                 break

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import takewhile
@@ -151,6 +151,13 @@ class EchoModel:
         """
         entry = (name, complete(find(name), values))
         return replace(self, effects=(*self.without_effect(name).effects, entry))
+
+    def with_effects(self, names: Iterable[str], values: Mapping[str, Values]) -> EchoModel:
+        """The model with the effects of these names added, each with its values."""
+        model = self
+        for name in names:
+            model = model.with_effect(name, values[name])
+        return model
 
     def without_effect(self, name: str) -> EchoModel:
         """The model without that effect."""
