@@ -78,7 +78,12 @@ class Recording:
         self, mic: Samples, reference: Samples, profile: Profile | None = None, *, sample_rate: int = SAMPLE_RATE
     ) -> None:
         self.mic, self.reference = at_16_khz(mic, sample_rate), at_16_khz(reference, sample_rate)
-        self.profile, self.known = profile or self_calibrate(self.mic, self.reference), profile is not None
+        self._given, self.profile = profile, profile or self_calibrate(self.mic, self.reference)
+
+    @property
+    def known(self) -> bool:
+        """Whether the profile was given, and not made from the recording."""
+        return self._given is not None
 
     @cached_property
     def straightened(self) -> Straightened:
@@ -88,7 +93,7 @@ class Recording:
     @cached_property
     def held_out(self) -> HeldOut:
         """Cut in two, for a proof. Raises SignalError where it is too short for that."""
-        return HeldOut(self.profile if self.known else None, self.straightened, self.mic, self.reference)
+        return HeldOut(self._given, self.straightened, self.mic, self.reference)
 
     def compare(self) -> Comparison:
         """Say how far the profile's prediction is from the recording, and where: `compare`."""
@@ -132,7 +137,7 @@ class Recording:
         early, too_short = self, ""
         try:
             stop = self.held_out.cut
-            early = Recording(self.mic[:stop], self.reference[:stop], self.profile)
+            early = Recording(self.mic[:stop], self.reference[:stop], self._given)
         except SignalError as error:
             too_short = str(error)
         while True:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from edgefilter.calibration.from_recording import self_calibrate
 from edgefilter.diagnosis import recording as asked
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.recording import Recording, add, compare, diagnose
@@ -107,3 +108,13 @@ def test_a_recording_without_a_profile_makes_one_of_itself() -> None:
     assert not recording.known and recording.profile.learned
     assert recording.compare().excess_db < 2.0  # six seconds teach a path to so much
     assert Recording(record(x), x, recording.profile).known
+
+
+@pytest.mark.slow
+def test_a_profile_made_of_the_recording_has_not_heard_the_seconds_of_the_proof(monkeypatch) -> None:
+    heard = []
+    monkeypatch.setattr(asked, "self_calibrate", lambda *of: heard.append(of[0].size) or self_calibrate(*of))
+    x = voice(10.0)
+    recording = Recording(record(x), x)
+    found = recording.diagnose_proven()
+    assert heard == [recording.mic.size, recording.held_out.cut] and found.comparison.recording.size <= heard[1]
