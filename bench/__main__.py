@@ -33,7 +33,6 @@ SCENARIOS = tuple(line.split()[0] for line in str(__doc__).splitlines()[2:] if l
 def common(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("of every scenario")
     group.add_argument("--output", type=Path, metavar="PATH", help="write PATH.json, PATH.md and its pictures")
-    group.add_argument("--html", action="store_true", help="write PATH.html as well, with sounds where there are any")
     group.add_argument("--every", type=int, default=1, metavar="N", help="take every N-th recording of each set")
     group.add_argument("--limit", type=int, metavar="N", help="take at most N recordings of each set")
     group.add_argument("--seed", type=int, default=1, metavar="N", help="of everything that is drawn (default: 1)")

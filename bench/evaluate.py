@@ -22,8 +22,7 @@ from bench import metrics, provenance, recordings, results, runner, systems
 from bench.metrics import QUANTITIES, SECOND, difference, mean, middle, pooled
 from bench.recordings import Cells, Clip
 from bench.systems import System
-from edgefilter.errors import EdgefilterError, UsageError
-from edgefilter.types import SAMPLE_RATE
+from edgefilter.errors import UsageError
 
 HEADLINE = ("unfiltered", "speexdsp-suppressed", "linear-uncalibrated", "linear-uncalibrated-learning",
             "crnn-uncalibrated-learning", "crnn", "crnn-learning")  # fmt: skip
@@ -42,7 +41,7 @@ NORMED = {systems.BATCH_NORM: "paper-crnn-narrow"}
 COUNTED = ("insertions", "deletions")
 """Of the words, over all words."""
 WORST = 10
-"""Clips that the page names, and lets hear with --html."""
+"""Clips that the page names."""
 NOTES = """Mean [95 % interval], drawn over speakers and rooms, not over utterances. WER: word errors over the span in which
 the human speaks, an utterance counted as at most 100 %; 'uncapped' and 'median' are of the utterances' own rates, 'pooled' is
 over all words, 'put in' and 'left out' are words over all words. ERLE: the last seconds of robot alone before the human.
@@ -94,13 +93,7 @@ def run(options: argparse.Namespace) -> str:
     tables += [worst_table(worst(rows, here), rows), results.absent(absent)]
     notes = "\n\n".join([NOTES, "What the source paper (Li, Hindriks & Kunneman 2024) concluded:", conclusions(rows)])
     parts = {"clips": results.columns(about(clips, rows)), "rows": results.columns(slim(rows))}
-    text = results.write(options.output, "evaluation", "Evaluation", made_with, tables, notes=notes, **parts)
-    if options.html and options.output:
-        heard = [sounds(clip, here) for clip in clips if clip.name in {row["clip"] for row in worst(rows, here)}]
-        whole = results.read(options.output.parent / f"{options.output.name}.json")
-        path = options.output.parent / f"{options.output.name}.html"
-        path.write_text(results.html_page(whole, heard), encoding="utf-8")
-    return text
+    return results.write(options.output, "evaluation", "Evaluation", made_with, tables, notes=notes, **parts)
 
 
 def find_clips(options: argparse.Namespace) -> list[Clip]:
@@ -293,23 +286,6 @@ def worst_table(found: Sequence[dict], rows: Sequence[dict]) -> dict:
         cells.append([row["clip"], row.get("capped"), row.get("si_sdr"), row["text"] or "", *heard])
     columns = ["clip", ("WER, %", 0), ("SI-SDR, dB", 1), "said", *(f"recognised, {name}" for name in shown)]
     return results.table("worst", title, columns, cells)
-
-
-def sounds(clip: Clip, here: Sequence[System]) -> dict:
-    """What the HTML page lets hear and see of one clip, all at the same peak."""
-    from edgefilter.report.media import colour_scale, sound, spectrogram_png
-
-    seen = slice(max(clip.span.start - 2 * SAMPLE_RATE, 0), clip.span.stop)
-    pieces = []
-    for one in [one for one in here if one.name in ("unfiltered", "crnn", "crnn-uncalibrated", "clean")]:
-        try:
-            samples = one.run(clip).samples[seen]
-        except EdgefilterError:
-            continue
-        peak = max(float(np.abs(samples).max(initial=0.0)), 1e-6)
-        picture = spectrogram_png(samples, colour_scale(samples))
-        pieces.append({"name": one.title, "picture": picture, "sound": sound(samples, 0.9 / peak)})
-    return {"title": clip.name, "text": clip.text or "", "pieces": pieces}
 
 
 # ---------------------------------------------------------------- the source paper's conclusions

@@ -1,4 +1,4 @@
-"""The one writer of results: a JSON file, from which the Markdown page, its pictures and an HTML page are generated.
+"""The one writer of results: a JSON file, from which the Markdown page and its pictures are generated.
 
 A file has parts, one for each program that wrote to it: {"schema", "parts": {NAME: {"title", "stamp", "notes", "tables",
 "plots", ...}}}. The stamp is that of bench/provenance.py.
@@ -6,9 +6,7 @@ A file has parts, one for each program that wrote to it: {"schema", "parts": {NA
 
 from __future__ import annotations
 
-import base64
 import hashlib
-import html
 import json
 import math
 import os
@@ -194,7 +192,7 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-# ---------------------------------------------------------------- Markdown, pictures, HTML
+# ---------------------------------------------------------------- Markdown, pictures
 
 
 def cell(value: Any, digits: int | None = None) -> str:
@@ -265,38 +263,6 @@ def picture(one: Mapping) -> bytes:
     out = BytesIO()
     figure.savefig(out, dpi=100)
     return out.getvalue()
-
-
-def html_page(whole: Mapping, clips: Sequence[Mapping] = ()) -> str:
-    """The results as one page that needs no network.
-
-    clips: {"title", "text", "pieces": [{"name", "sound", "picture"}]}, sounds and pictures as data addresses.
-    """
-    style = "body{font:15px sans-serif;margin:2em}td{padding:2px 8px}tr:nth-child(even){background:#eee}"
-    parts = [f"<!doctype html><meta charset=utf-8><title>bench</title><style>{style}</style>"]
-    for part in whole["parts"].values():
-        parts += [
-            f"<h1>{html.escape(part['title'])}</h1>",
-            _paragraphs(head(part["stamp"])),
-            _paragraphs(part["notes"]),
-        ]
-        for one in part["tables"]:
-            rows = [one["columns"], *([cell(v, d) for v, d in zip(row, one["digits"])] for row in one["rows"])]
-            lines = ["".join(f"<td>{html.escape(str(text))}</td>" for text in row) for row in rows]
-            body = "".join(f"<tr>{line}</tr>" for line in lines)
-            parts += [f"<h2>{html.escape(one['title'])}</h2>", _paragraphs(one["text"]), f"<table>{body}</table>"]
-        for one in part["plots"]:
-            parts.append(f'<img src="data:image/png;base64,{base64.b64encode(picture(one)).decode()}">')
-    for clip in clips:
-        parts += [f"<h2>{html.escape(clip['title'])}</h2>", _paragraphs(clip["text"])]
-        for piece in clip["pieces"]:
-            parts.append(f"<p>{html.escape(piece['name'])}<br><audio controls src='{piece['sound']}'></audio><br>")
-            parts.append(f"<img src='{piece['picture']}'></p>")
-    return "\n".join(parts) + "\n"
-
-
-def _paragraphs(text: str) -> str:
-    return "".join(f"<p>{html.escape(block)}</p>" for block in text.split("\n\n") if block)
 
 
 # ---------------------------------------------------------------- tables that other pages quote

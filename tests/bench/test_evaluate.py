@@ -75,24 +75,6 @@ def test_processes_give_the_same_figures_and_a_run_that_was_cut_off_goes_on(live
     )
 
 
-@pytest.mark.slow
-def test_a_page_to_listen_to(live: Path, tmp_path: Path) -> None:
-    run(
-        tmp_path / "a",
-        "evaluate",
-        live,
-        "--systems",
-        "unfiltered,clean",
-        "--cache",
-        tmp_path / "c",
-        "--jobs",
-        1,
-        "--html",
-    )
-    page = (tmp_path / "a.html").read_text()
-    assert page.count("<audio") == 4 and "<h2>At a glance</h2>" in page  # two clips, microphone and human
-
-
 def test_what_is_no_recording_is_said_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert program.main(["evaluate", str(tmp_path)]) == 1
     said = capsys.readouterr().err
