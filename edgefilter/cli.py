@@ -8,13 +8,14 @@ import io
 import math
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, get_args
 
 from edgefilter import __version__
+from edgefilter.audio.channels import Channels
 from edgefilter.commands.display import STATUS_LEGEND, own_words_only
 from edgefilter.commands.outputs import check_outputs
 from edgefilter.commands.signals import on_signal
@@ -24,7 +25,7 @@ from edgefilter.echo.user_effects import load_effect
 from edgefilter.engines import ENGINES, HAVE_MODEL
 from edgefilter.errors import EdgefilterError, UsageError, printable
 from edgefilter.filter.barge_in import BargeInSettings
-from edgefilter.types import ALL_CHANNELS, MOST_MICROPHONES, SoundFor
+from edgefilter.types import SoundFor
 
 ENGINE = {
     "default": "auto",
@@ -32,7 +33,7 @@ ENGINE = {
     "help": f"auto, {', '.join(ENGINES)} (default: %(default)s); docs/cli.md says what each does",
 }
 MIC_CHANNELS = {
-    "type": lambda text: channels(text),
+    "type": Channels.parse,
     "metavar": "N,N,...|all",
     "help": "channels that are microphones, one to eight, from 0, or 'all' (docs/arrays.md); otherwise the mean is taken",
 }
@@ -423,16 +424,6 @@ positive = number(0.0, 1e6, "a number above 0")
 eight = whole(1, 8, "1 to 8 channels")
 channel = whole(0, 63, "the number of a channel, 0 to 63")
 """Of a device or a file, counted from 0: interfaces of studios have so many."""
-
-
-def channels(text: str) -> Sequence[int]:
-    """Numbers of channels, one to eight of them, none twice; or all."""
-    if text.strip() == "all":
-        return ALL_CHANNELS
-    found = [channel(part) for part in text.split(",")]
-    if len(set(found)) < len(found) or len(found) > MOST_MICROPHONES:
-        raise argparse.ArgumentTypeError(f"'{text}' does not name one to {MOST_MICROPHONES} different channels")
-    return found
 
 
 def main(argv: list[str] | None = None) -> int:

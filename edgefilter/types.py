@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, TypeAlias, TypedDict, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edgefilter.errors import SignalError, UsageError
+from edgefilter.errors import SignalError
 
 SAMPLE_RATE = 16000
 """Samples per second of everything inside; sources convert at the door."""
@@ -18,8 +17,6 @@ PRE_ROLL = 64
 """Samples (4 ms) of the impulse response before the direct sound: what equalisers and linear-phase filters of a
 loudspeaker ring ahead of it."""
 MOST_MICROPHONES = 8
-ALL_CHANNELS: tuple[int, ...] = ()
-"""In the place of numbers of channels: all that a device or a file has."""
 LOUDEST = 1e6
 """Largest sample that is taken, 120 dB over full scale: no recording is louder, and powers stay within float32."""
 
@@ -235,20 +232,6 @@ class Stats(TypedDict):
     array: ArrayStats | None
     learning: dict[str, object] | None
     deadline: DeadlineStats | None
-
-
-def which_channels(wanted: Sequence[int] | None, there: int, where: str) -> list[int] | None:
-    """The numbers of the channels that are wanted; ALL_CHANNELS means all that are there, None none in particular.
-
-    Raises UsageError where those are more than MOST_MICROPHONES. where: what has them, for the message.
-    """
-    if wanted is None or len(wanted):
-        return None if wanted is None else list(wanted)
-    if there > MOST_MICROPHONES:
-        raise UsageError(
-            f"{where} has {there} channels, expected at most {MOST_MICROPHONES} microphones: name them with --mic-channels"
-        )
-    return list(range(there))
 
 
 def as_samples(x: object, name: str) -> Samples:

@@ -8,6 +8,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from edgefilter.audio import pulse
+from edgefilter.audio.channels import Channels
 from edgefilter.audio.port import STREAM_LATENCY_S, InputPort, OutputPort, SpokenReference, silence_alsa
 from edgefilter.audio.pulse import STAND_INS, Device, Named
 from edgefilter.audio.reader import Reader
@@ -72,8 +73,8 @@ def monitor_of(output: Named = None) -> Device:
     return found[0] if found else monitor(devices, device)
 
 
-def input_port(name: Named, latency_s: float = STREAM_LATENCY_S, channels: Sequence[int] | None = None) -> InputPort:
-    """An input that can be opened; channels: numbers, from 0, of those that are wanted, or ALL_CHANNELS."""
+def input_port(name: Named, latency_s: float = STREAM_LATENCY_S, channels: Channels | None = None) -> InputPort:
+    """An input that can be opened; channels: those that are wanted in place of their mean."""
     device = find(name, "input")
     if device.name in STAND_INS or device.pulse_name:  # PortAudio says 32 of whatever the server has
         device = replace(device, inputs=pulse.channels_of(device.pulse_name) or device.inputs)

@@ -6,14 +6,16 @@ import errno
 import io
 import os
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 import soundfile
 
+from edgefilter.audio.channels import Channels
 from edgefilter.audio.protocols import Sink, Source
 from edgefilter.audio.raw import PcmSink, PcmSource, clip_note, to_pcm16
 from edgefilter.audio.reader import Reader
@@ -35,17 +37,16 @@ MOST_RECORDED = (2**32 - 2**16) // 4
 def open_source(
     path: str | Path,
     reference: str | Path | None = None,
-    channels: Sequence[int] | None = None,
-    reference_channel: int | None = None,
+    channels: Channels | None = None,
 ) -> Source:
     """The source for a recording and its reference; '-', standard input, and named pipes bring both as raw stereo.
 
-    channels, reference_channel: as of FileSource.
+    channels: as of FileSource.
     """
     named = Path(path).is_fifo()
     if str(path) != "-" and not named:
-        return FileSource(path, reference, channels=channels, reference_channel=reference_channel)
-    if channels is not None or reference_channel is not None:
+        return FileSource(path, reference, channels=channels)
+    if channels is not None:
         raise UsageError(
             f"'{path}' as input is stereo, microphone and reference, found channels asked for: give a file or a device"
         )
@@ -90,9 +91,8 @@ class FileSource(Source):
     """A recording and, if there is one, the reference of what the robot said, as blocks of 16 kHz mono.
 
     The recording decides the length: a shorter reference is followed by silence, a longer one is cut, without one the
-    reference is silence. `notes` is complete after construction. channels: numbers, from 0, of the recording's channels
-    that are microphones, in place of the mean of all. reference_channel: the one that is the reference.
-    Raises AudioFileError for an unusable file (see Reader).
+    reference is silence. `notes` is complete after construction. channels: those of the recording that are
+    microphones, in place of the mean of all, and the one that is the reference. Raises AudioFileError for an unusable file (see Reader).
     """
 
     def __init__(
@@ -100,13 +100,12 @@ class FileSource(Source):
         mic_path: str | Path,
         reference_path: str | Path | None = None,
         block: int = 4096,
-        channels: Sequence[int] | None = None,
-        reference_channel: int | None = None,
+        channels: Channels | None = None,
     ) -> None:
-        self._mic = Reader(mic_path, "recording", channels)
+        self._mic = Reader(mic_path, "recording", channels and replace(channels, reference=None))
         self._reference = None if reference_path is None else Reader(reference_path, "reference")
-        if reference_channel is not None:
-            self._reference = Reader(mic_path, "reference in", [reference_channel])
+        if channels is not None and channels.reference is not None:
+            self._reference = Reader(mic_path, "reference in", Channels([channels.reference]))
         self.microphones = self._mic.given
         self._block = block
         self.total = self._mic.total

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import numpy as np
 
+from edgefilter.audio.channels import Channels
 from edgefilter.audio.device import find, input_port, output_port
 from edgefilter.audio.pairing import MAX_WAIT, TOLERANCE, Pairing
 from edgefilter.audio.port import START_S, InputPort, SpokenReference, pause
@@ -22,9 +23,8 @@ class LiveSource(Source):
 
     patience_s: how long a device may be away; silence stands in meanwhile, by the clock, and it is opened again as soon
     as that can be done. Raises DeviceError, after everything received has been delivered, when a device is away for
-    longer. reference None: silence. channels: numbers, from 0, of the microphone device's channels that are
-    microphones, in place of their mean. reference_channel: the one beside them that is the reference, in place of a
-    second device with a second clock.
+    longer. reference None: silence. channels: those of the microphone device that are microphones, in place of
+    their mean, and the one that is the reference, in place of a second device with a second clock.
     """
 
     live = True
@@ -34,12 +34,10 @@ class LiveSource(Source):
         mic: Named,
         reference: Named | SpokenReference = None,
         patience_s: float = 0.0,
-        channels: Sequence[int] | None = None,
-        reference_channel: int | None = None,
+        channels: Channels | None = None,
     ) -> None:
-        self._both = reference_channel is not None
-        taken = None if channels is None else [*channels, *([reference_channel] if self._both else ())]
-        self._mic = SteadyInput(_opener(mic, taken), patience_s)
+        self._both = channels is not None and channels.reference is not None
+        self._mic = SteadyInput(_opener(mic, channels), patience_s)
         opened = self._mic.port.wanted
         self.microphones = 1 if opened is None else len(opened) - self._both
         self._reference = None if reference is None else SteadyInput(_opener(reference), patience_s)
@@ -160,7 +158,7 @@ class LiveSource(Source):
 
 
 def _opener(
-    device: Named | SpokenReference, channels: Sequence[int] | None = None
+    device: Named | SpokenReference, channels: Channels | None = None
 ) -> Callable[[], InputPort | SpokenReference]:
     """What makes an input of a device, each time anew; what is spoken goes on where it was."""
     if isinstance(device, SpokenReference):

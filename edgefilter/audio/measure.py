@@ -9,6 +9,7 @@ import numpy as np
 from scipy import signal
 
 from edgefilter.audio import virtual
+from edgefilter.audio.channels import Channels
 from edgefilter.audio.device import input_port, output_port
 from edgefilter.audio.port import START_S, STREAM_LATENCY_S, InputPort, OutputPort, clock, pause
 from edgefilter.audio.protocols import Source
@@ -23,7 +24,7 @@ def play_and_record(
     samples: Samples,
     latency_s: float = STREAM_LATENCY_S,
     tell: Callable[[float], None] = lambda left_s: None,
-    channels: Sequence[int] | None = None,
+    channels: Channels | None = None,
     keep: Callable[[Samples], None] = lambda recorded: None,
 ) -> tuple[Samples, str]:
     """Play samples (n,) at 16 kHz and return what the microphone hears until a second after them, and what was lost, in words.
@@ -32,7 +33,7 @@ def play_and_record(
     constant: the devices' buffers appear as additional delay, so that the sound never seems to arrive before it is
     played. Silence goes first, since sound servers swallow a stream's start.
     latency_s: the buffers asked of the sound system; the larger, the fewer holes. tell: called again and again with the
-    seconds that are left. channels: numbers, from 0, of those that are wanted in place of their mean. keep: called with
+    seconds that are left. channels: those that are wanted in place of their mean. keep: called with
     what was recorded, also where a device stops or an interrupt comes before its end, if it has begun.
     Raises DeviceError where a device cannot be opened or stops, UsageError for the virtual microphone, which hears nothing.
     """

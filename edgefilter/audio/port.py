@@ -9,20 +9,21 @@ import ctypes
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
 import numpy as np
 
+from edgefilter.audio.channels import Channels
 from edgefilter.audio.pairing import BUFFER_S, Inlet, Outlet
 from edgefilter.audio.pulse import OPENING, Device, leading_to
 from edgefilter.audio.raw import delivered
 from edgefilter.dsp.resample import Resampler
 from edgefilter.dsp.ring import Ring
-from edgefilter.errors import DeviceError, UsageError
-from edgefilter.types import SAMPLE_RATE, Samples, which_channels
+from edgefilter.errors import DeviceError
+from edgefilter.types import SAMPLE_RATE, Samples
 
 POLL_S = 0.004
 """Between two looks at a device: a quarter of a hop."""
@@ -76,17 +77,16 @@ def quiet() -> Iterator[None]:
 class Port:
     """One PortAudio stream and how its rate and channels are brought to 16 kHz mono.
 
-    latency_s: the buffer asked of the sound system, seconds. wanted: numbers of an input's channels, from 0, to be
-    delivered in that order in place of their mean; ALL_CHANNELS is all. Raises DeviceError where the device cannot be
-    opened, UsageError where it lacks a channel.
+    latency_s: the buffer asked of the sound system, seconds. wanted: an input's channels, to be delivered in that
+    order in place of their mean. Raises DeviceError where the device cannot be opened, UsageError where it lacks a channel.
     """
 
     def __init__(
-        self, sounddevice: Any, device: Device, kind: str, latency_s: float, wanted: Sequence[int] | None = None
+        self, sounddevice: Any, device: Device, kind: str, latency_s: float, wanted: Channels | None = None
     ) -> None:
         self._sd = sounddevice
         self._name = f"{kind} device '{device}'"
-        self.wanted = which_channels(wanted, device.channels(kind), self._name)
+        self.wanted = None if wanted is None else wanted.among(device.channels(kind), self._name)
         self.kind, self.device, self.latency_s = kind, device, latency_s
         self.rate, self.channels = self._settings()
         self.notes: list[str] = []
@@ -107,11 +107,6 @@ class Port:
         check = self._sd.check_input_settings if self.kind == "input" else self._sd.check_output_settings
         there = self.device.channels(self.kind)
         least = 1 if self.wanted is None else max(self.wanted) + 1
-        if least > there:
-            raise UsageError(
-                f"{self._name} has {there} channels, found channel {least - 1} asked for, counted from 0: choose others"
-                " ('edgefilter devices')"
-            )
         counts = {least, max(2, there)} if self.wanted else {1, 2, max(2, there)}
         refusal = ""
         for rate in (SAMPLE_RATE, round(self.device.rate)):
@@ -174,7 +169,7 @@ def _words(error: Exception) -> str:
 class InputPort(Port):
     """An input whose callback fills an Inlet, read as 16 kHz mono, or as the channels that are wanted."""
 
-    def __init__(self, sounddevice: Any, device: Device, latency_s: float, wanted: Sequence[int] | None) -> None:
+    def __init__(self, sounddevice: Any, device: Device, latency_s: float, wanted: Channels | None) -> None:
         super().__init__(sounddevice, device, "input", latency_s, wanted)
         count = len(self.wanted) if self.wanted else 1
         self.inlet = Inlet(round(BUFFER_S * self.rate), count if count > 1 else None)

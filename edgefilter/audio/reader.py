@@ -6,17 +6,18 @@ import os
 import re
 import shlex
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import soundfile
 import soxr
 
+from edgefilter.audio.channels import Channels
 from edgefilter.audio.raw import delivered
 from edgefilter.dsp.resample import RATES
 from edgefilter.errors import AudioFileError
-from edgefilter.types import LOUDEST, SAMPLE_RATE, Array, Samples, which_channels
+from edgefilter.types import LOUDEST, SAMPLE_RATE, Array, Samples
 
 OTHER_FORMS = {
     b"ftyp": "an MPEG-4 file (m4a, mp4)",
@@ -34,14 +35,14 @@ _ENDLESS = 0x7FFFF000
 class Reader:
     """A WAV, FLAC or Ogg file of any rate and channel count, delivered at 16 kHz with its channels averaged.
 
-    wanted: numbers of channels, from 0, to be delivered in that order in place of their mean; ALL_CHANNELS is all.
+    channels: those to be delivered in that order in place of their mean.
     role: how messages name the file ("recording"). The file is read once at opening, so that a damaged one is refused
     before anything is made from it. total: round(n * 16000 / rate) samples. given: channels that are delivered. silent:
     every sample is zero.
     Raises AudioFileError for a file that is missing, empty, truncated, not audio, or holds what no recording does.
     """
 
-    def __init__(self, path: str | Path, role: str = "recording", wanted: Sequence[int] | None = None) -> None:
+    def __init__(self, path: str | Path, role: str = "recording", channels: Channels | None = None) -> None:
         self.path = Path(path)
         self.role = role
         self.notes: list[str] = []
@@ -50,9 +51,8 @@ class Reader:
         with self._open() as file:
             self.rate, self.channels = file.samplerate, file.channels
             self._check_header(file)
-            self.wanted = which_channels(wanted, self.channels, f"{role} {path}")
+            self.wanted = None if channels is None else channels.among(self.channels, f"{role} {path}", AudioFileError)
             self.given = len(self.wanted) if self.wanted else 1
-            self._check_channels()
             length = self._scan(file)
         self.total = (2 * length * SAMPLE_RATE + self.rate) // (2 * self.rate)
         if self.total == 0:
@@ -130,13 +130,6 @@ class Reader:
         elif "without an End-Of-Stream flag" in file.extra_info:
             held = "the Ogg stream stops before its end mark"
             raise self._error(f"is truncated: {held}; copy it again, or re-save what is there")
-
-    def _check_channels(self) -> None:
-        lacking = [channel for channel in self.wanted or () if channel >= self.channels]
-        if lacking:
-            several = f"{self.channels} channels, 0 to {self.channels - 1}"
-            has = several if self.channels > 1 else "channel 0 alone"
-            raise self._error(f"has {has}, found channel {lacking[0]} asked for: choose others with --mic-channels")
 
     def _blocks(self, file: soundfile.SoundFile) -> Iterator[Array]:
         """Yield (n, channels) float32, SAMPLE_RATE values at a time; a decoder that gives up is an error with its place."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from edgefilter.alignment.lag_search import MOST_LAG_S
 from edgefilter.audio import pulse, virtual
+from edgefilter.audio.channels import Channels
 from edgefilter.audio.device import find, input_port, monitor_of
 from edgefilter.audio.live import LiveSource
 from edgefilter.audio.measure import Channel, Trial, listen, play_through
@@ -73,7 +74,7 @@ def examine(
     microphone: str,
     reference: str | None,
     speaker: str | None,
-    channels: Sequence[int] | None = None,
+    channels: Channels | None = None,
     profile: Profile | None = None,
 ) -> Iterator[Check]:
     """All checks, each as soon as it is done. speaker: what plays the chirps; None for none of them.
@@ -139,7 +140,7 @@ def _server() -> Iterator[Check]:
 
 
 def _open(
-    ports: dict[str, InputPort], role: str, name: str | None, channels: Sequence[int] | None = None
+    ports: dict[str, InputPort], role: str, name: str | None, channels: Channels | None = None
 ) -> Iterator[Check]:
     """Find the input and see at which rate it can be opened."""
     device = find(name if name is not None else pulse.monitor(virtual.SPEAKER) or monitor_of("default"), "input")
@@ -183,7 +184,7 @@ def array_checks(channels: Sequence[Channel]) -> Iterator[Check]:
 
 
 def _set_up(
-    ports: dict[str, InputPort], speaker: str, channels: Sequence[int] | None, profile: Profile | None
+    ports: dict[str, InputPort], speaker: str, channels: Channels | None, profile: Profile | None
 ) -> Iterator[Check]:
     """Play chirps and hear them as a run would, of an array in the first microphone; then hold the others beside it."""
     microphone, reference = ports["microphone"], ports["reference"]

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 
 import numpy as np
 
+from edgefilter.audio.channels import Channels
 from edgefilter.audio.reader import Reader
 from edgefilter.commands.display import say
 from edgefilter.diagnosis.channels import doubtful_channels
@@ -17,10 +17,10 @@ from edgefilter.profile.data import Profile
 from edgefilter.types import Samples
 
 
-def read(path: str, role: str, channels: Sequence[int] | None = None) -> Samples:
+def read(path: str, role: str, channels: Channels | None = None) -> Samples:
     """A whole recording (n,), 16 kHz mono, which messages call by its role; conversions are said on standard error.
 
-    channels: numbers, from 0, of those that are wanted in place of the mean; (n, channels) of several. Raises
+    channels: those that are wanted in place of the mean; (n, channels) of several. Raises
     AudioFileError for a file that is unusable.
     """
     return _whole(Reader(path, role, channels))

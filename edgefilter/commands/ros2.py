@@ -7,11 +7,11 @@ import os
 import signal
 from pathlib import Path
 
+from edgefilter.audio.channels import Channels
 from edgefilter.commands.display import print_result, say
 from edgefilter.errors import UsageError
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.types import ALL_CHANNELS
 
 
 def main(args: argparse.Namespace) -> None:
@@ -42,8 +42,8 @@ def _node(args: argparse.Namespace) -> None:
         args.profile, engine=args.engine, barge_in=BargeInSettings(judge="network", confirm_s=args.confirm_s)
     )
     names = args.mic, args.reference, args.silenced, args.human
-    wanted = range(args.channels) if args.mic_channels == ALL_CHANNELS else args.mic_channels
-    topics = Topics(*names, args.rate, args.channels, wanted, args.reference_channels, args.reference_channel)
+    array = Channels.named(args.mic_channels, args.reference_channel)
+    topics = Topics(*names, args.rate, args.channels, args.reference_channels, array)
     node = Node(ego, topics, domain)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: node.stop())

@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 import gc
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
 from edgefilter.audio import pulse, virtual
+from edgefilter.audio.channels import Channels
 from edgefilter.audio.device import find, monitor_of, speaker
 from edgefilter.audio.files import form_of, open_sink, open_source
 from edgefilter.audio.live import LiveSink, LiveSource
@@ -30,7 +31,7 @@ from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.learning.background import BackgroundLearner
 from edgefilter.profile.data import Profile
 from edgefilter.session import RunReport, Verdict, filter_blocks
-from edgefilter.types import ALL_CHANNELS, SAMPLE_RATE, Block
+from edgefilter.types import SAMPLE_RATE, Block
 
 FILE_ENDINGS = (
     *(".wav", ".flac", ".ogg", ".mp3", ".aiff", ".aif", ".w64", ".opus", ".txt", ".raw", ".pcm"),
@@ -45,7 +46,7 @@ def main(args: argparse.Namespace) -> int:
     profile = Profile.load(file) if file else None
     channels = channels_of(args, profile)
     source = make_source(args, speech, channels)
-    if channels == ALL_CHANNELS and args.mic_channels is None:
+    if channels is not None and args.mic_channels is None:
         source.notes.append(f"all {source.microphones} channels are microphones, since the profile is of an array")
     ego, choice = make_filter(args, source.live, profile)
     check_request(args, ego, source)
@@ -111,31 +112,25 @@ def make_speech(args: argparse.Namespace) -> SpokenReference | None:
     return speaker(args.speaker, Reader(args.play, "speech"))
 
 
-def channels_of(args: argparse.Namespace, profile: Profile | None) -> Sequence[int] | None:
-    """The microphones that --mic-channels names; raises UsageError for a reference channel without or among them.
+def channels_of(args: argparse.Namespace, profile: Profile | None) -> Channels | None:
+    """The channels that are named; where none are, live, and the profile is of several microphones: all that the device has.
 
-    Where none are named, live, and the profile is of several: all that the device has.
+    Raises UsageError for a reference channel without or among microphones, and beside another reference.
     """
-    if args.reference_channel is None:
-        if args.mic_channels is None and profile and profile.microphones > 1 and is_device(args.input):
-            return ALL_CHANNELS
-        return args.mic_channels
-    if not args.mic_channels or args.reference_channel in args.mic_channels:
-        found = "none" if not args.mic_channels else f"channel {args.reference_channel} among them"
-        raise UsageError(f"--reference-channel goes with --mic-channels that name the others, found {found}")
-    if args.reference is not None or args.play is not None:
+    if args.reference_channel is not None and (args.reference is not None or args.play is not None):
         other = "--play" if args.play is not None else "--reference"
         raise UsageError(f"--reference-channel is the reference, found {other} too: leave one of them out")
-    return args.mic_channels
+    named = Channels.named(args.mic_channels, args.reference_channel)
+    return Channels() if named is None and profile and profile.microphones > 1 and is_device(args.input) else named
 
 
-def make_source(args: argparse.Namespace, speech: SpokenReference | None, channels: Sequence[int] | None) -> Source:
+def make_source(args: argparse.Namespace, speech: SpokenReference | None, channels: Channels | None) -> Source:
     """A file or pipe where --input is one, else the live devices.
 
     The reference defaults to the monitor of the output device, for the virtual microphone to that of its speaker.
     """
     if not is_device(args.input):
-        return open_source(args.input, args.reference, channels, args.reference_channel)
+        return open_source(args.input, args.reference, channels)
     if args.reference is not None and looks_like_file(args.reference):
         raise UsageError(
             f"live, the reference is a device, found the file {args.reference}: leave --reference out or name a monitor"
@@ -148,7 +143,7 @@ def make_source(args: argparse.Namespace, speech: SpokenReference | None, channe
         own = pulse.monitor(virtual.SPEAKER) if args.output == virtual.HUMAN else None
         played_on = args.output if is_device(args.output) and args.output != virtual.HUMAN else "default"
         reference = own or monitor_of(played_on)
-    return LiveSource(mic, reference, patience_s=math.inf, channels=channels, reference_channel=args.reference_channel)
+    return LiveSource(mic, reference, patience_s=math.inf, channels=channels)
 
 
 def make_sink(name: str, latency: int, wait: bool) -> Sink:

@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from edgefilter.audio.channels import Channels
 from edgefilter.audio.pairing import Pairing
 from edgefilter.audio.raw import delivered, of_pcm16, to_pcm16
 from edgefilter.audio.sample_clock import HELD_S, SampleClock
@@ -25,7 +26,6 @@ from edgefilter.errors import UsageError
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.filter.turns import WAITING_S, drop_sound
-from edgefilter.integrations.channels import named, taken
 from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, SET_UP_WRONG, Event, Samples, as_microphones
 
 MOST_QUEUED_S = WAITING_S
@@ -60,7 +60,7 @@ class Duplex:
         Called with each `Event`, in the thread of `hear`. Without it the latest thousand are kept for `events()`.
     clock : callable
         Seconds, monotonic.
-    mic_channels : sequence of int, optional
+    mic_channels : sequence of int or Channels, optional
         Numbers, from 0, of the channels that are microphones, one to eight; the answer sounds like the first named.
         Without it `hear` takes all channels for microphones, and `hear_pcm16`, which gets what a device brings, their mean.
     reference_channel : int, optional
@@ -102,11 +102,11 @@ class Duplex:
         patience_s: float = PATIENCE_S,
         on_event: Callable[[Event], None] | None = None,
         clock: Callable[[], float] = time.monotonic,
-        mic_channels: Sequence[int] | None = None,
+        mic_channels: Sequence[int] | Channels | None = None,
         reference_channel: int | None = None,
     ) -> None:
-        self._wanted = named(mic_channels, reference_channel)
-        self._both = reference_channel is not None
+        self._wanted = Channels.named(mic_channels, reference_channel)
+        self._both = self._wanted is not None and self._wanted.reference is not None
         self.listeners: list[Callable[[Event], object]] = []
         self.ego = EgoFilter(barge_in=BargeInSettings(judge="network")) if ego is None else ego
         if self.ego.waits_for_end:
@@ -179,7 +179,7 @@ class Duplex:
         for each of the two resamplers. Raises SignalError as `EgoFilter.process` does.
         """
         if self._wanted is not None:
-            samples = taken(np.reshape(samples, (len(samples), -1)), self._wanted)
+            samples = self._wanted.taken(np.reshape(samples, (len(samples), -1)))
         samples = np.ascontiguousarray(as_microphones(samples, "mic", MOST_MICROPHONES + self._both).T)
         with self._hear_lock:
             channels = 1 if samples.ndim == 1 else samples.shape[1]

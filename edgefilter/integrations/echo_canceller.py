@@ -13,11 +13,11 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from edgefilter.audio.channels import Channels
 from edgefilter.audio.raw import FULL_SCALE, to_pcm16
 from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import SignalError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.integrations.channels import named, taken
 from edgefilter.integrations.duplex import as_pcm16
 from edgefilter.integrations.wire import RATES
 from edgefilter.profile.data import Profile
@@ -81,9 +81,9 @@ class EchoCanceller:
             raise UsageError(f"sample_rate is {sample_rate}, expected {expected}")
         if not 1 <= channels <= MOST_MICROPHONES:
             raise UsageError(f"channels is {channels}, expected 1 to {MOST_MICROPHONES}: leave some microphones out")
-        array = named(mic_channels, there=channels)
+        array = Channels.named(mic_channels, there=channels)
         self.sample_rate, self.channels = sample_rate, channels
-        self._heard = [array] if array else [[number] for number in range(channels)]
+        self._heard = [array] if array else [Channels([number]) for number in range(channels)]
         self._filters = [EgoFilter(profile, engine=engine, output=output) for _ in self._heard]
         first = self._filters[0]
         if first.waits_for_end:
@@ -115,7 +115,7 @@ class EchoCanceller:
         rate = self.sample_rate
         for each in self._filters:
             each.reset()
-        self._to_filter = [Resampler(rate, SAMPLE_RATE, len(heard)) for heard in self._heard]
+        self._to_filter = [Resampler(rate, SAMPLE_RATE, len(wanted.mics or ())) for wanted in self._heard]
         self._of_ref = Resampler(rate, SAMPLE_RATE)
         self._from_filter = [Resampler(SAMPLE_RATE, rate) for _ in self._heard]
         self.delay = self._filters[0].latency
@@ -178,7 +178,7 @@ class EchoCanceller:
         said = self._of_ref.push(played.reshape(count, -1).mean(axis=1, dtype=np.float32))
         new = []
         for ego, wanted, down, up in zip(self._filters, self._heard, self._to_filter, self._from_filter):
-            new.append(up.push(ego.process(down.push(taken(heard, wanted)), said)))
+            new.append(up.push(ego.process(down.push(wanted.taken(heard)), said)))
             if ego is not self._filters[0]:
                 ego.events()  # `events` tells of the first microphone
         ready = np.concatenate((self._ready, np.stack(new)), axis=1)

@@ -18,6 +18,7 @@ from livekit import rtc
 from livekit.agents import vad
 from livekit.agents.voice import io
 
+from edgefilter.audio.channels import Channels
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.integrations.duplex import Duplex, as_pcm16, from_pcm16
 from edgefilter.integrations.turns import TurnByTurn
@@ -46,9 +47,8 @@ class EgoProcessor(rtc.FrameProcessor[rtc.AudioFrame]):
         reference_channel: int | None = None,
     ) -> None:
         # the room holds speech ahead: none is late
-        self.duplex = Duplex(
-            ego, patience_s=0.0, on_event=on_event, mic_channels=mic_channels, reference_channel=reference_channel
-        )
+        array = Channels.named(mic_channels, reference_channel)
+        self.duplex = Duplex(ego, patience_s=0.0, on_event=on_event, mic_channels=array)
         self._ready = b""
 
     def tap(self, output: io.AudioOutput) -> io.AudioOutput:

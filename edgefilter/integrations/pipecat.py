@@ -27,8 +27,8 @@ from pipecat.frames.frames import (
 )
 from pipecat.processors.frame_processor import FrameDirection, FrameProcessor
 
+from edgefilter.audio.channels import Channels
 from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.integrations.channels import named
 from edgefilter.integrations.duplex import Duplex, as_pcm16, from_pcm16
 from edgefilter.integrations.turns import TurnByTurn
 from edgefilter.types import SAMPLE_RATE, Event
@@ -58,8 +58,8 @@ class EgoFilters:
         mic_channels: Sequence[int] | None = None,
         reference_channel: int | None = None,
     ) -> None:
-        named(mic_channels, reference_channel, in_channels)
-        self.duplex = Duplex(ego, on_event=on_event, mic_channels=mic_channels, reference_channel=reference_channel)
+        array = Channels.named(mic_channels, reference_channel, in_channels)
+        self.duplex = Duplex(ego, on_event=on_event, mic_channels=array)
         self.params: dict[str, Any] = {
             "audio_in_filter": _Microphone(self.duplex, in_channels),
             "audio_in_channels": in_channels,

@@ -5,7 +5,7 @@ Needs `pip install '.[ros2]'` in a checkout.
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from cyclonedds.core import DDSException, Policy, Qos
@@ -17,9 +17,9 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
+from edgefilter.audio.channels import Channels
 from edgefilter.errors import DeviceError, SignalError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.integrations.channels import named
 from edgefilter.integrations.duplex import Duplex
 from edgefilter.types import SET_UP_WRONG, Event
 
@@ -95,10 +95,10 @@ class DiagnosticArray(IdlStruct, typename="diagnostic_msgs::msg::dds_::Diagnosti
 class Topics:
     """Names of what comes in and goes out.
 
-    rate: Hz, of the microphone's and the reference's 16-bit samples. channels: of the microphone's. mic_channels: those
-    that are microphones of an array; the human is then one channel, otherwise as many as came in, of their mean.
-    reference_channel: the one of the microphone's that holds what is played, in place of the topic of the reference.
-    reference_channels: of that topic, None for as many as the microphone's.
+    rate: Hz, of the microphone's and the reference's 16-bit samples. channels: of the microphone's. reference_channels:
+    of the reference's topic, None for as many as the microphone's. array: those of the microphone's that are microphones
+    of an array, and the one in place of the topic of the reference; the human is then one channel, otherwise as many as
+    came in, of their mean.
     """
 
     mic: str
@@ -107,9 +107,8 @@ class Topics:
     human: str
     rate: int
     channels: int
-    mic_channels: Sequence[int] | None
     reference_channels: int | None
-    reference_channel: int | None
+    array: Channels | None
 
 
 class Node:
@@ -117,9 +116,8 @@ class Node:
 
     def __init__(self, ego: EgoFilter, topics: Topics, domain: int) -> None:
         self._topics = topics
-        microphones, reference = topics.mic_channels, topics.reference_channel
-        named(microphones, reference, topics.channels)
-        self.duplex = Duplex(ego, on_event=self._tell, mic_channels=microphones, reference_channel=reference)
+        array = Channels.named(topics.array, there=topics.channels)
+        self.duplex = Duplex(ego, on_event=self._tell, mic_channels=array)
         self._wrong: dict[str, str] = {}
         self._stop = threading.Event()
         try:
@@ -182,7 +180,7 @@ class Node:
 
     def _hear(self, message: AudioData) -> None:
         topics = self._topics
-        answers = None if topics.mic_channels is None else 1
+        answers = None if topics.array is None else 1
         human = self.duplex.hear_pcm16(bytes(message.data), topics.rate, topics.channels, answers)
         if human:
             self._human.write(AudioData(data=list(human)))

@@ -23,11 +23,10 @@ from websockets.exceptions import ConnectionClosed
 from websockets.frames import Opcode
 from websockets.http11 import Request, Response
 
-from edgefilter.audio.raw import of_pcm16
+from edgefilter.audio.raw import delivered, of_pcm16
 from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import EdgefilterError, SignalError
 from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.integrations.channels import taken
 from edgefilter.integrations.doors import complain_briefly, in_one_line
 from edgefilter.integrations.duplex import Pace, as_pcm16, from_pcm16
 from edgefilter.integrations.wire import Decode, Form, TwoStreams, message_of
@@ -147,7 +146,9 @@ class Session:
         both = of_pcm16(message, channels)
         if wrong := self._pace.note(len(both), self.form.rate):
             yield [self._told(Event("rate_mismatch", self.ego.stats()["samples"], wrong))]
-        yield from self._filter(taken(both, range(channels - 1)), np.ascontiguousarray(both[:, -1]))
+        yield from self._filter(
+            np.ascontiguousarray(delivered(both, range(channels - 1))), np.ascontiguousarray(both[:, -1])
+        )
 
     def _filter(self, mic: Samples, ref: Samples) -> Iterator[list[Answer]]:
         for at in range(0, len(mic), self._part):
@@ -409,7 +410,7 @@ def _let_go(connection: ServerConnection) -> None:
 
 def _microphones_of(pcm: bytes, count: int) -> Samples:
     """Samples of one microphone, (n,), or of several, (n, count)."""
-    return taken(of_pcm16(pcm, count), range(count))
+    return np.ascontiguousarray(delivered(of_pcm16(pcm, count), range(count)))
 
 
 def _text(kind: str, **more: object) -> str:

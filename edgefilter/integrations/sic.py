@@ -25,10 +25,10 @@ from sic_framework.core.connector import SICConnector
 from sic_framework.core.message_python2 import AudioMessage, AudioRequest, SICConfMessage, SICMessage, SICRequest
 from sic_framework.core.utils import is_sic_instance
 
+from edgefilter.audio.channels import Channels
 from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
-from edgefilter.integrations.channels import named, numbers
 from edgefilter.integrations.duplex import Duplex
 from edgefilter.types import SAMPLE_RATE, Event
 
@@ -40,7 +40,7 @@ def _options(words: list[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--engine", default="auto", help="one beside which the network can judge speech")
     parser.add_argument("--channels", type=int, default=1, help="of the microphone's sound, interleaved")
     told = "those of them that form an array, from 0, as 0,1,2,3; otherwise the mean of all is taken"
-    parser.add_argument("--mic-channels", type=numbers, help=told)
+    parser.add_argument("--mic-channels", type=Channels.parse, help=told)
     told = "longest time from the suspicion that the human speaks to certainty, s"
     parser.add_argument("--confirm-s", type=float, default=BargeInSettings.confirm_s, help=told)
     return vars(parser.parse_args(words))
@@ -69,16 +69,16 @@ def _ears(
     profile: str | None,
     engine: str,
     channels: int,
-    mic_channels: Sequence[int] | None,
+    mic_channels: Sequence[int] | Channels | None,
     confirm_s: float,
     on_event: Callable[[Event], None] | None = None,
 ) -> tuple[Duplex, int]:
     """The filter for a microphone of so many channels, and their number; raises EdgefilterError where it cannot be made."""
     if channels < 1:
         raise UsageError(f"channels is {channels}, expected at least 1")
-    named(mic_channels, there=channels)
+    array = Channels.named(mic_channels, there=channels)
     ego = EgoFilter(profile, engine=engine, barge_in=BargeInSettings(judge="network", confirm_s=confirm_s))
-    return Duplex(ego, on_event=on_event, mic_channels=mic_channels), channels
+    return Duplex(ego, on_event=on_event, mic_channels=array), channels
 
 
 class SpeechMessage(SICMessage):

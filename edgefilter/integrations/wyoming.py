@@ -38,12 +38,12 @@ from wyoming.snd import Played
 from wyoming.vad import VoiceStarted, VoiceStopped
 
 from edgefilter import __version__
+from edgefilter.audio.channels import Channels
 from edgefilter.dsp.resample import RATES
 from edgefilter.errors import EdgefilterError, SignalError, UsageError, printable
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.filter.turns import BEFORE_S
-from edgefilter.integrations.channels import named, numbers
 from edgefilter.integrations.doors import complain_briefly, is_own
 from edgefilter.integrations.duplex import MOST_QUEUED_S, Duplex, as_pcm16, from_pcm16
 from edgefilter.integrations.turns import TurnByTurn
@@ -96,15 +96,14 @@ class EgoService:
         mic_format: AudioFormat = AudioFormat(16_000, 2, 1),
         snd_format: AudioFormat = AudioFormat(22_050, 2, 1),
         stop_for_speech: bool = False,
-        mic_channels: Sequence[int] | None = None,
+        mic_channels: Sequence[int] | Channels | None = None,
         recogniser: str | None = None,
         reference_channel: int | None = None,
     ) -> None:
-        named(mic_channels, reference_channel, None if "://" in microphone else mic_format.channels)
+        there = None if "://" in microphone else mic_format.channels
+        array = Channels.named(mic_channels, reference_channel, there)
         self._events: list[Event] = []
-        self.duplex = Duplex(
-            ego, on_event=self._events.append, mic_channels=mic_channels, reference_channel=reference_channel
-        )
+        self.duplex = Duplex(ego, on_event=self._events.append, mic_channels=array)
         self.recogniser, self.mic_format, self.player = recogniser, mic_format, Player(loudspeaker, snd_format)
         self._microphone, self._stop_for_speech = microphone, stop_for_speech
         self.listeners: set[_Listener] = set()
@@ -491,7 +490,7 @@ def main(words: list[str] | None = None) -> int:
         parser.add_argument(f"--{end}-command-rate", type=int, default=rate, help="what the command's sound has")
         parser.add_argument(f"--{end}-command-channels", type=int, default=1, help="what the command's sound has")
     told = "channels of the microphone that form an array, from 0, as 1,2,3; otherwise the mean of all is taken"
-    parser.add_argument("--mic-channels", type=numbers, help=told)
+    parser.add_argument("--mic-channels", type=Channels.parse, help=told)
     told = "channel of the microphone, from 0, that holds what is played; goes with --mic-channels"
     parser.add_argument("--reference-channel", type=int, help=told)
     parser.add_argument("--recogniser", help="URI of a service that makes text of speech: it gets finished turns")

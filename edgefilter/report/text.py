@@ -189,7 +189,7 @@ def next_command(found: Diagnosis, names: Mapping[str, Any], written: str | None
     """Give the one command that follows a diagnosis; written: the profile that it wrote, if any."""
     if found.ranking and written is None:
         return add_command([finding.effect for finding in in_order(found.ranking)], names)
-    channels = f" --mic-channels {','.join(map(str, names['mic_channels']))}" if names.get("mic_channels") else ""
+    channels = f" --mic-channels {names['mic_channels']}" if names.get("mic_channels") else ""
     if found.verdict == "unexplained" and not names.get("report"):
         return f"edgefilter diagnose {files_given(names)}{channels} --report page.html"
     profile = written or names["profile"]
@@ -206,7 +206,7 @@ def add_command(effects: Sequence[str], names: Mapping[str, Any]) -> str:
     files = files_given(names)
     output = shlex.quote(str(Path(str(names["profile"])).with_suffix(f".{'.'.join(effects)}.npz")))
     if channels := names.get("mic_channels"):
-        return f"edgefilter diagnose {files} --mic-channels {','.join(map(str, channels))} --apply {output}"
+        return f"edgefilter diagnose {files} --mic-channels {channels} --apply {output}"
     return f"edgefilter add {' '.join(effects)} {files} --output {output}"
 
 

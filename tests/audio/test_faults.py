@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import soundfile
 
+from edgefilter.audio.channels import Channels
 from edgefilter.audio.files import FileSink, FileSource
 from edgefilter.audio.live import LiveSink, LiveSource
 from edgefilter.audio.pairing import TOLERANCE
@@ -19,7 +20,6 @@ from edgefilter.commands.run import check_output, limited
 from edgefilter.errors import DeviceError, UsageError
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.session import filter_blocks
-from edgefilter.types import ALL_CHANNELS
 from tests.audio.virtual_portaudio import CALLBACK_S, VirtualDevice
 from tests.filter.array_scene import calibration
 
@@ -292,7 +292,7 @@ def test_late_sound_is_not_lost_and_drift_is_no_loss(ppm):
 
 def test_the_channels_of_a_device_that_are_named_are_taken_and_one_of_them_is_the_reference(plug):
     plug(VirtualDevice("array", "input", rate=48000.0, takes=(48000, 6), channels=6))
-    source = LiveSource("array", channels=[1, 2, 4], reference_channel=5)
+    source = LiveSource("array", channels=Channels([1, 2, 4], 5))
     with source:
         blocks = list(limited(source, 16000))
     mic, ref = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("mic", "ref"))
@@ -307,7 +307,7 @@ def test_an_array_that_is_unplugged_comes_back_with_all_its_microphones(plug):
     system = plug(array, ref)
     system.at(3.0, lambda: setattr(array, "plugged", False))
     system.at(8.0, lambda: setattr(array, "plugged", True))
-    source = LiveSource("array", "ref", patience_s=FOREVER, channels=[0, 3])
+    source = LiveSource("array", "ref", patience_s=FOREVER, channels=Channels([0, 3]))
     with source:
         mic = np.concatenate([block.mic for block in limited(source, 15 * 16000)])
     assert mic.shape == (15 * 16000, 2) and mic[-1] == pytest.approx([0.1, 0.4])
@@ -317,19 +317,19 @@ def test_an_array_that_is_unplugged_comes_back_with_all_its_microphones(plug):
 
 def test_a_channel_that_a_device_lacks_is_one_line(plug):
     plug(VirtualDevice("array", "input", channels=4))
-    with pytest.raises(UsageError, match="input device 'array' has 4 channels, found channel 4 asked for"):
-        LiveSource("array", channels=[1, 4])
+    with pytest.raises(UsageError, match="input device 'array' has 4 channels, 0 to 3, found channel 4 asked for"):
+        LiveSource("array", channels=Channels([1, 4]))
 
 
 def test_all_channels_of_a_device_are_opened_where_that_is_asked(plug):
     plug(VirtualDevice("array", "input", channels=4), VirtualDevice("mixer", "input", channels=32))
-    source = LiveSource("array", channels=ALL_CHANNELS)
+    source = LiveSource("array", channels=Channels())
     with source:
         heard = np.concatenate([block.mic for block in limited(source, 16000)])
     assert source.microphones == 4 and any("channels 0, 1, 2, 3 of 4" in note for note in source.notes)
     np.testing.assert_allclose(heard[-1], [0.1, 0.2, 0.3, 0.4], atol=1e-6)
     with pytest.raises(UsageError, match="'mixer' has 32 channels, expected at most 8 microphones: name them"):
-        LiveSource("mixer", channels=ALL_CHANNELS)
+        LiveSource("mixer", channels=Channels())
 
 
 def test_a_run_whose_learner_cannot_be_started_says_so_and_filters_all(both, tmp_path, monkeypatch, capsys):

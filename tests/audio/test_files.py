@@ -13,12 +13,13 @@ import pytest
 import soundfile
 
 from edgefilter.audio import files
+from edgefilter.audio.channels import Channels
 from edgefilter.audio.files import Disk, FileSink, FileSource, Recorder, open_source, whole
 from edgefilter.commands.display import write_json
 from edgefilter.errors import AudioFileError, EdgefilterError, UsageError
 from edgefilter.report.html import write_page
 from edgefilter.report.plots import plot_before_after
-from edgefilter.types import ALL_CHANNELS, Block
+from edgefilter.types import Block
 
 ROOT = Path(__file__).parents[2]
 
@@ -351,31 +352,31 @@ def test_a_wav_of_more_than_its_sizes_can_say_is_marked_as_going_on_to_the_end(t
 def test_channels_that_are_wanted_come_in_their_order(tmp_path):
     four = np.random.default_rng(0).uniform(-0.5, 0.5, (5000, 4)).astype(np.float32)
     soundfile.write(tmp_path / "four.wav", four, 16000, "FLOAT")
-    source = FileSource(tmp_path / "four.wav", channels=[2, 0], reference_channel=3, block=700)
+    source = FileSource(tmp_path / "four.wav", channels=Channels([2, 0], 3), block=700)
     blocks = list(source)
     assert source.microphones == 2 and source.notes[0].endswith("channels 2, 0 of 4")
     assert np.array_equal(np.concatenate([block.mic for block in blocks]), four[:, [2, 0]])
     assert np.array_equal(np.concatenate([block.ref for block in blocks]), four[:, 3])
-    alone = np.concatenate([block.mic for block in FileSource(tmp_path / "four.wav", channels=[1])])
+    alone = np.concatenate([block.mic for block in FileSource(tmp_path / "four.wav", channels=Channels([1]))])
     assert np.array_equal(alone, four[:, 1])
 
 
 def test_all_channels_of_a_file_are_microphones_where_that_is_asked(tmp_path):
     soundfile.write(tmp_path / "four.wav", np.arange(400, dtype=np.int16).reshape(-1, 4), 16000, "PCM_16")
-    source = FileSource(tmp_path / "four.wav", channels=ALL_CHANNELS)
+    source = FileSource(tmp_path / "four.wav", channels=Channels())
     heard = np.concatenate([block.mic for block in source])
     assert source.microphones == 4 and source.notes[0].endswith("channels 0, 1, 2, 3 of 4")
     np.testing.assert_array_equal(heard * 32768, np.arange(400).reshape(-1, 4))
     soundfile.write(tmp_path / "nine.wav", np.zeros((400, 9)), 16000, "PCM_16")
     with pytest.raises(UsageError, match="nine.wav has 9 channels, expected at most 8 microphones"):
-        FileSource(tmp_path / "nine.wav", channels=ALL_CHANNELS)
+        FileSource(tmp_path / "nine.wav", channels=Channels())
 
 
 def test_channels_are_resampled_together(tmp_path):
     t = np.arange(48000) / 48000
     sound = 0.3 * np.stack((np.sin(2 * np.pi * 440 * t), np.cos(2 * np.pi * 440 * t)), axis=1)
     soundfile.write(tmp_path / "two.wav", sound, 48000, "FLOAT")
-    heard = np.concatenate([block.mic for block in FileSource(tmp_path / "two.wav", channels=[0, 1])])
+    heard = np.concatenate([block.mic for block in FileSource(tmp_path / "two.wav", channels=Channels([0, 1]))])
     assert heard.shape == (16000, 2)
     assert np.allclose(heard[100:-100] ** 2 @ np.ones(2), 0.09, atol=1e-3)
 
@@ -383,9 +384,9 @@ def test_channels_are_resampled_together(tmp_path):
 def test_a_channel_that_is_not_there_is_one_line(tmp_path):
     soundfile.write(tmp_path / "two.wav", np.zeros((100, 2)), 16000)
     with pytest.raises(AudioFileError, match="has 2 channels, 0 to 1, found channel 2 asked for"):
-        FileSource(tmp_path / "two.wav", channels=[0, 2])
+        FileSource(tmp_path / "two.wav", channels=Channels([0, 2]))
     with pytest.raises(UsageError, match="stereo, microphone and reference, found channels asked for"):
-        open_source("-", channels=[0])
+        open_source("-", channels=Channels([0]))
 
 
 def test_several_channels_are_written_and_read_again(tmp_path):

@@ -2,13 +2,14 @@
 
 import os
 import subprocess
-import sys
 import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 import soundfile
+
+from tests.program import argv
 
 ROOT = Path(__file__).parents[2]
 STEREO = np.random.default_rng(0).integers(-9000, 9000, (4000, 2)).astype("<i2")
@@ -23,7 +24,7 @@ def pipes(tmp_path):
 
 def run(folder, *words):
     return subprocess.run(
-        [sys.executable, "-m", "edgefilter.cli", *map(str, words)],
+        argv(*words),
         cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=60,
     )  # fmt: skip
 

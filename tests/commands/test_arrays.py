@@ -67,7 +67,9 @@ def test_what_cannot_be_is_one_line_and_the_output_is_left_alone(folder: Path) -
     one_line(run(folder, "--mic-channels", "1,5"), 1, "has 5 channels, 0 to 4, found channel 5")
     one_line(run(folder, "--mic-channels", "1,1"), 2, "'1,1' does not name one to 8 different channels")
     one_line(run(folder, "--mic-channels", "-1"), 2, "--mic-channels")
-    one_line(run(folder, "--reference-channel", "4"), 2, "--reference-channel goes with --mic-channels", "found none")
+    one_line(
+        run(folder, "--reference-channel", "4"), 2, "reference_channel is 4, expected mic_channels that name the others"
+    )
     both = ("--mic-channels", "1,2", "--reference-channel", "4", "--reference", folder / "five.wav")
     one_line(run(folder, *both), 2, "--reference-channel is the reference, found --reference too")
     one_line(

@@ -2,7 +2,6 @@
 
 import os
 import subprocess
-import sys
 import threading
 import time
 
@@ -17,6 +16,7 @@ from edgefilter.commands.observers import Availability, EventCommand, lower
 from edgefilter.filter.barge_in import INTERRUPTIONS, SUSPICIONS
 from edgefilter.session import Progress
 from edgefilter.types import Event
+from tests.program import argv
 
 STARTED, STOPPED = (Event(f"speech_{word}", 24000, "probability 0.98") for word in ("started", "stopped"))
 
@@ -148,6 +148,6 @@ def test_a_terminal_that_goes_away_does_not_cost_the_run_a_sample(tmp_path):
     read, write = os.pipe()
     os.close(read)
     words = ["--input", "mic.wav", "--reference", "ref.wav", "--engine", "linear", "--output", "out.wav"]
-    done = subprocess.run([sys.executable, "-m", "edgefilter.cli", "run", *words], cwd=tmp_path, stderr=write)
+    done = subprocess.run(argv("run", *words), cwd=tmp_path, stderr=write)
     os.close(write)
     assert done.returncode == 0 and soundfile.info(tmp_path / "out.wav").frames == 6 * 16_000

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from tests.commands.program import edgefilter, here, one_line
+from tests.program import edgefilter, here, one_line
 
 RATE = 16000
 
@@ -225,12 +225,7 @@ def test_an_interrupted_run_leaves_a_valid_file_with_what_was_received(tmp_path,
     process = subprocess.Popen(
         [
             sys.executable,
-            "-m",
-            "edgefilter.cli",
-            "run",
-            "--input",
-            "-",
-            "--output",
+            *"-m edgefilter.cli run --input - --output".split(),
             str(tmp_path / "out.wav"),
             "--engine",
             "bypass",

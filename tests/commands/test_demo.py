@@ -3,7 +3,6 @@
 import json
 import re
 import subprocess
-import sys
 
 import pytest
 import soundfile
@@ -12,13 +11,14 @@ from edgefilter.cli import main
 from edgefilter.commands import demo as command
 from edgefilter.commands.outputs import HIDDEN_FILES
 from edgefilter.filter.ego_filter import EgoFilter
+from tests.program import argv
 
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo")
     result = subprocess.run(
-        [sys.executable, "-m", "edgefilter.cli", "demo", "--output", folder, "--json", folder / "demo.json"],
+        argv("demo", "--output", folder, "--json", folder / "demo.json"),
         capture_output=True,
         text=True,
     )

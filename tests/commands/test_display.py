@@ -13,6 +13,7 @@ from edgefilter.commands import display
 from edgefilter.session import Progress
 from edgefilter.types import Block
 from tests.diagnosis.robot_scene import profile, record, voice
+from tests.program import argv
 
 STATS = {
     "engine": "crnn",
@@ -134,7 +135,7 @@ def test_a_long_command_says_what_it_does_before_it_has_done_it_where_there_is_n
     profile().save(tmp_path / "robot.npz")
     files = ["--profile", "robot.npz", "--recording", "mic.wav", "--reference", "ref.wav"]
     child = subprocess.Popen(
-        [sys.executable, "-m", "edgefilter.cli", "diagnose", *files],
+        argv("diagnose", *files),
         cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:

@@ -8,7 +8,6 @@ import sys
 import termios
 import threading
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,21 +16,8 @@ import soundfile
 from edgefilter.cli import main
 from edgefilter.commands import doctor
 from edgefilter.errors import ModelError
-from tests.commands.program import here
 from tests.diagnosis.robot_scene import profile, record, voice
-
-DEMO = Path(__file__).parents[2] / "edgefilter/demo_data"
-
-
-def program(folder, *words, **options):
-    return subprocess.run(
-        [sys.executable, "-m", "edgefilter.cli", *map(str, words)],
-        cwd=folder,
-        stderr=subprocess.PIPE,
-        text=True,
-        timeout=120,
-        **options,
-    )
+from tests.program import DEMO, argv, edgefilter, here
 
 
 def one_line(done, code, *expected):
@@ -106,7 +92,7 @@ def test_a_folder_that_cannot_be_made_leaves_the_output_of_an_earlier_run_alone(
 def test_a_reader_that_goes_away_ends_the_program_without_a_traceback(folder):
     for words in (("profile", "show", "p.npz"), ("profile", "show", "p.npz", "--json", "-")):
         child = subprocess.Popen(
-            [sys.executable, "-m", "edgefilter.cli", *words],
+            argv(*words),
             cwd=folder,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -118,14 +104,14 @@ def test_a_reader_that_goes_away_ends_the_program_without_a_traceback(folder):
 
 def test_a_full_disk_behind_standard_output_is_one_line(folder):
     with open("/dev/full", "w") as full:
-        one_line(program(folder, "profile", "show", "p.npz", stdout=full), 1, "No space left on device")
+        one_line(edgefilter("profile", "show", "p.npz", stdout=full), 1, "No space left on device")
 
 
 def test_a_name_that_the_terminal_cannot_show_does_not_stop_the_program(folder, monkeypatch):
     monkeypatch.setenv("PYTHONIOENCODING", "ascii")
     made = ("remove", "playback_gain", "--profile", "with.npz", "--output", "größer.npz")
     profile().with_echo(profile().echo.with_effect("playback_gain", {"gain_db": 1.0})).save(folder / "with.npz")
-    done = program(folder, *made, stdout=subprocess.PIPE)
+    done = edgefilter(*made)
     assert done.returncode == 0 and "gr\\xf6\\xdfer.npz" in done.stdout and (folder / "größer.npz").exists(), (
         done.stderr
     )
@@ -162,20 +148,7 @@ def test_a_json_file_that_fails_does_not_cost_the_adapted_profile(tmp_path, monk
     x = voice(2.0)
     soundfile.write(tmp_path / "ref.wav", x, 16000, "FLOAT")
     profile().save(tmp_path / "p.npz")
-    words = [
-        "run",
-        "--input",
-        "ref.wav",
-        "--reference",
-        "ref2.wav",
-        "--profile",
-        "p.npz",
-        "--engine",
-        "linear",
-        "--output",
-        "o.wav",
-        "--quiet",
-    ]
+    words = "run --input ref.wav --reference ref2.wav --profile p.npz --engine linear --output o.wav --quiet".split()
     soundfile.write(tmp_path / "ref2.wav", x, 16000, "FLOAT")
     done = here(*words, "--save-profile", "new.npz", "--json", "/dev/full")
     assert done.returncode == 1 and "No space left" in done.stderr and (tmp_path / "new.npz").exists()
@@ -187,19 +160,7 @@ def test_the_effects_that_became_part_of_the_adapted_path_are_said(tmp_path, mon
     soundfile.write(tmp_path / "ref.wav", x, 16000, "FLOAT")
     echo = profile().echo.with_effect("bandlimit", {"cutoff_hz": 4000.0}).with_effect("playback_gain", {"gain_db": 1.0})
     profile().with_echo(echo).save(tmp_path / "p.npz")
-    words = [
-        "run",
-        "--input",
-        "ref.wav",
-        "--profile",
-        "p.npz",
-        "--engine",
-        "linear",
-        "--output",
-        "o.wav",
-        "--save-profile",
-        "new.npz",
-    ]
+    words = "run --input ref.wav --profile p.npz --engine linear --output o.wav --save-profile new.npz".split()
     done = here(*words)
     assert (
         done.returncode == 0
@@ -228,19 +189,7 @@ def wait_until_full(pipe):
 @pytest.mark.slow
 def test_a_second_signal_ends_a_run_whose_reader_does_not_read(folder):
     child = subprocess.Popen(
-        [
-            sys.executable,
-            "-m",
-            "edgefilter.cli",
-            "run",
-            "--input",
-            "-",
-            "--output",
-            "-",
-            "--engine",
-            "bypass",
-            "--quiet",
-        ],
+        argv(*"run --input - --output - --engine bypass --quiet".split()),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -3,7 +3,6 @@
 import json
 import os
 import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from edgefilter.commands.observers import EventLog
 from edgefilter.errors import AudioFileError
 from edgefilter.types import Event
 from tests.diagnosis.robot_scene import profile
+from tests.program import argv
 
 
 @pytest.fixture
@@ -51,7 +51,7 @@ def test_a_log_that_takes_no_more_ends_and_the_run_does_not(folder, capsys):
 
 
 def test_a_reader_that_went_away_ends_the_log_and_not_the_run(folder):
-    command = [sys.executable, "-m", "edgefilter.cli", *RUN, "--output", "out.wav", "--log-json", "-"]
+    command = argv(*RUN, "--output", "out.wav", "--log-json", "-")
     read, write = os.pipe()
     os.close(read)
     done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True)

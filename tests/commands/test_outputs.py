@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -18,6 +17,7 @@ import soundfile
 from edgefilter.cli import build_parser, main
 from edgefilter.commands.outputs import FOLDERS, READ, WRITTEN
 from tests.diagnosis.robot_scene import profile
+from tests.program import edgefilter
 
 NEITHER = {
     "mic_channels", "reference_channel", "reference_channels", "channel",
@@ -176,17 +176,7 @@ def test_a_model_that_the_environment_names_is_not_written_over(heard, capsys, m
         (["run", "--input", "mic.wav", "--output", "new/mic.wav", "--record", "new"], ("--record", "--output")),
         (["run", "--input", "mic.wav", "--output", "o.wav", "--json", "O.WAV"], ("--json", "--output")),
         (
-            [
-                "compare",
-                "--recording",
-                "mic.wav",
-                "--reference",
-                "reference.wav",
-                "--json",
-                "r",
-                "--report",
-                "../heard/r",
-            ],
+            "compare --recording mic.wav --reference reference.wav --json r --report ../heard/r".split(),
             ("--report", "--json"),
         ),
         (["demo", "--output", "d", "--json", "d/filtered.wav"], ("--json", "--output")),
@@ -203,19 +193,14 @@ def test_two_outputs_that_are_one_file_are_refused(heard, capsys, monkeypatch, w
 
 @pytest.mark.slow
 def test_standard_input_and_output_are_seen_through(heard):
-    def program(*words, **streams):
-        return subprocess.run(
-            [sys.executable, "-m", "edgefilter.cli", *map(str, words)], stderr=subprocess.PIPE, text=True, **streams
-        )
-
     before = content(heard)
     with open(heard / "mic.wav", "rb") as file:
-        done = program("run", "--input", "-", "--engine", "bypass", "--output", heard / "mic.wav", stdin=file)
+        done = edgefilter("run", "--input", "-", "--engine", "bypass", "--output", heard / "mic.wav", stdin=file)
     assert done.returncode == 2 and "also an input (input -)" in done.stderr
     with open(heard / "mic.wav", "ab") as file:
-        done = program(*run(heard, "--output", "-"), stdout=file)
+        done = edgefilter(*run(heard, "--output", "-"), stdout=file)
     assert done.returncode == 2 and "--output - is also an input" in done.stderr
-    done = program(*run(heard, "--output", "-", "--json", "-"), stdout=subprocess.PIPE)
+    done = edgefilter(*run(heard, "--output", "-", "--json", "-"))
     assert done.returncode == 2 and "mix on standard output" in done.stderr
     assert content(heard) == before
 
@@ -226,12 +211,7 @@ def test_devices_and_streams_that_writing_cannot_destroy_are_allowed_twice(heard
         "compare",
         "--recording",
         heard / "none.wav",
-        "--reference",
-        "/dev/null",
-        "--json",
-        "/dev/null",
-        "--report",
-        "/dev/null",
+        *"--reference /dev/null --json /dev/null --report /dev/null".split(),
     ]
     assert main([str(word) for word in words]) == 1  # for the recording that is not there, not for the devices
 

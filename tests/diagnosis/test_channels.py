@@ -12,8 +12,8 @@ import soundfile
 from edgefilter import Profile, ProfileError, SignalError
 from edgefilter.diagnosis.channels import doubtful_channels, is_clipped
 from edgefilter.types import SAMPLE_RATE
-from tests.commands.program import edgefilter, one_line
 from tests.filter.array_scene import PATHS, calibration, fan, noise, talk
+from tests.program import edgefilter, one_line
 
 
 @pytest.fixture

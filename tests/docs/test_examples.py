@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 import soundfile
 
+from tests.program import argv
+
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "docs/examples"
 DEMO = ROOT / "edgefilter/demo_data"
@@ -119,20 +121,9 @@ def stereo():
 
 def test_what_the_human_says_is_cut_out_behind_the_command_line(stereo, tmp_path):
     log = tmp_path / "events.jsonl"
-    command = [
-        "run",
-        "--input",
-        "-",
-        "--profile",
-        DEMO / "profile.npz",
-        "--output",
-        "-",
-        "--engine",
-        "crnn",
-        "--no-learn",
-    ]
+    command = [*"run --input - --profile".split(), DEMO / "profile.npz", *"--output - --engine crnn --no-learn".split()]
     human = subprocess.run(
-        [sys.executable, "-m", "edgefilter.cli", *map(str, command), "--quiet", "--log-json", log],
+        argv(*map(str, command), "--quiet", "--log-json", log),
         input=stereo[6 * RATE :].astype("<i2").tobytes(), stdout=subprocess.PIPE, cwd=ROOT, check=True,
     )  # fmt: skip
     said, _ = run("listen.py", log, stdin=human.stdout)

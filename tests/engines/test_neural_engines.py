@@ -22,6 +22,7 @@ from edgefilter.filter.stream import Stream
 from edgefilter.profile.data import LEARNED, Profile
 from edgefilter.types import Frame
 from tests import conformance
+from tests.program import argv
 
 DATA = Path(__file__).parents[1] / "data"
 ROOT = Path(__file__).parents[2]
@@ -320,21 +321,14 @@ def test_the_command_line_takes_a_model_and_reports_it(tmp_path):
 
     def run(engine: str, model: Path) -> subprocess.CompletedProcess:
         words = [
-            "run",
-            "--input",
-            "mic.wav",
-            "--reference",
-            "ref.wav",
-            "--engine",
+            *"run --input mic.wav --reference ref.wav --engine".split(),
             engine,
             "--model",
             str(model),
             "--output",
             "out.wav",
         ]
-        return subprocess.run(
-            [sys.executable, "-m", "edgefilter.cli", *words], cwd=tmp_path, capture_output=True, text=True
-        )
+        return subprocess.run(argv(*words), cwd=tmp_path, capture_output=True, text=True)
 
     done = run("crnn", EDGE)
     assert done.returncode == 0 and "algorithmic latency 32 ms" in done.stderr, done.stderr

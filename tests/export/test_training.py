@@ -35,16 +35,7 @@ def data(tmp_path_factory):
         str(humans),
         "--robots",
         str(robots),
-        "--count",
-        "2",
-        "--seed",
-        "4",
-        "--jobs",
-        "1",
-        "--recipe",
-        "paper",
-        "--rooms",
-        "2",
+        *"--count 2 --seed 4 --jobs 1 --recipe paper --rooms 2".split(),
     ]
     arguments += ["--output", str(folder / "items")]
     dataset.main(arguments)

@@ -6,7 +6,6 @@ And honest words where nothing fits.
 import json
 import os
 import subprocess
-import sys
 import time
 from itertools import islice
 from pathlib import Path
@@ -27,6 +26,7 @@ from edgefilter.filter import budget
 from edgefilter.filter.budget import Figures, choose, fits, held_to, measure, pace, scene, timings
 from edgefilter.filter.stream import Stream
 from edgefilter.profile.data import Profile
+from tests.program import argv
 
 DEMO = budget.DEMO
 SMALL = Path(__file__).parents[1] / "data/crnn.onnx"
@@ -315,7 +315,7 @@ def test_the_measurement_is_held_to_the_cores_and_lets_go_afterwards():
 
 def run(folder, *more):
     result = subprocess.run(
-        [sys.executable, "-m", "edgefilter.cli", "run", "--input", DEMO / "human.flac"]
+        argv("run", "--input", DEMO / "human.flac")
         + ["--output", folder / "out.wav", "--json", folder / "j", *more],
         capture_output=True, text=True, timeout=120,
     )  # fmt: skip

@@ -502,7 +502,7 @@ def test_the_channel_that_is_named_first_is_what_is_heard_of_it():
 
 
 def test_channels_that_are_not_there_are_one_line():
-    with pytest.raises(SignalError, match="brings 2 channels, counted from 0, and channel 2 is named: name others"):
+    with pytest.raises(SignalError, match="has 2 channels, 0 to 1, found channel 2 asked for: choose others"):
         Duplex(EgoFilter(engine="bypass"), mic_channels=[0, 2]).hear_pcm16(bytes(40), RATE, 2)
     for wrong in ([], [1, 1], [-1, 0], range(9)):
         with pytest.raises(UsageError, match="expected the numbers of one to 8 different channels, from 0"):
@@ -544,7 +544,7 @@ def test_a_reference_channel_that_cannot_be_one_is_one_line():
             Duplex(EgoFilter(engine="bypass"), mic_channels=mics, reference_channel=wrong)
     with pytest.raises(UsageError, match="reference_channel is 5, expected mic_channels that name the others"):
         Duplex(EgoFilter(engine="bypass"), reference_channel=5)
-    with pytest.raises(SignalError, match="brings 2 channels, counted from 0, and channel 5 is named"):
+    with pytest.raises(SignalError, match="has 2 channels, 0 to 1, found channel 5 asked for"):
         Duplex(EgoFilter(engine="bypass"), mic_channels=[0], reference_channel=5).hear_pcm16(bytes(40), RATE, 2)
 
 

@@ -240,5 +240,5 @@ def test_of_one_named_channel_the_others_are_not_heard():
     canceller = EchoCanceller(16000, 2, engine="bypass", mic_channels=[1])
     out = canceller.process(NOISE, NOISE)
     np.testing.assert_allclose(out[canceller.delay :], NOISE[: -canceller.delay, 1], atol=1e-6)
-    with pytest.raises(UsageError, match="channel 2 is named, found 2 channels"):
+    with pytest.raises(UsageError, match="2 channels, 0 to 1, found channel 2"):
         EchoCanceller(16000, 2, engine="bypass", mic_channels=[0, 2])

@@ -114,7 +114,7 @@ def test_the_loopback_of_the_device_is_the_reference_where_it_is_named(talking):
     np.testing.assert_allclose(out, expected[: out.size], atol=1 / 32768)
     part = slice(16_000, 32_000)
     assert np.mean(out[part] ** 2) < 0.01 * np.mean(both[part, 1] ** 2), "nothing was handed to the loudspeaker"
-    with pytest.raises(UsageError, match="channel 3 is named, found 3 channels"):
+    with pytest.raises(UsageError, match="3 channels, 0 to 2, found channel 3"):
         EgoFilters(EgoFilter(engine="linear"), in_channels=3, mic_channels=[1, 2], reference_channel=3)
 
 

@@ -30,6 +30,7 @@ from edgefilter.integrations import serve as module
 from edgefilter.integrations.opus import Decoder, Encoder
 from edgefilter.integrations.serve import Service
 from edgefilter.integrations.wire import HEADER, MOST_WAITING_BYTES, Form, TwoStreams
+from tests.program import argv
 
 ROOT = Path(__file__).parents[2]
 DEMO = Path(edgefilter.__file__).parent / "demo_data"
@@ -759,7 +760,7 @@ def test_a_client_that_falls_silent_for_good_is_told_and_leaves_its_place(monkey
 def service(tmp_path):
     """The command as it is typed, and its address."""
     words = ["serve", "--port", "0", "--profile", str(DEMO / "profile.npz")]
-    process = subprocess.Popen([sys.executable, "-m", "edgefilter.cli", *words], stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(argv(*words), stderr=subprocess.PIPE, text=True)
     line = process.stderr.readline()
     assert line.startswith("serving ws://127.0.0.1:"), line
     yield process, line.split()[1]

@@ -134,7 +134,7 @@ def test_without_a_server_it_is_one_line(cloud):
     ("words", "said"),
     [
         (["--profile", str(PROGRAM)], "profile"),
-        (["--engine", "linear", "--channels", "4", "--mic-channels", "1,2,4"], "channel 4 is named, found 4 channels"),
+        (["--engine", "linear", "--channels", "4", "--mic-channels", "1,2,4"], "4 channels, 0 to 3, found channel 4"),
         (["--engine", "linear", "--channels", "0"], "channels is 0, expected at least 1"),
     ],
 )

@@ -9,7 +9,7 @@ import pytest
 import soundfile
 
 from edgefilter import Profile
-from tests.live.test_run_live import ROOT, edgefilter
+from tests.program import ROOT, argv
 
 pytestmark = pytest.mark.slow
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 def calibrating(server, folder, *arguments):
     files = ("--output", folder / "p.npz", "--json", folder / "p.json")
     return subprocess.Popen(
-        edgefilter("calibrate", "--live", *files, *arguments),
+        argv("calibrate", "--live", *files, *arguments),
         env=server.environment, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
 

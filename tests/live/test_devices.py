@@ -11,6 +11,7 @@ import soundfile
 import soxr
 
 from tests.filter.test_arrays import calibration
+from tests.program import argv
 
 pytestmark = pytest.mark.slow
 
@@ -112,7 +113,7 @@ def test_all_channels_of_the_microphone_are_opened_where_the_profile_is_of_an_ar
     asked = ["run", "--input", "mic", "--profile", tmp_path / "robot.npz", "--engine", "linear", "--no-learn"]
     asked += ["--seconds", "2", "--output", tmp_path / "out.wav", "--json", tmp_path / "run.json", "--quiet"]
     done = subprocess.run(
-        [sys.executable, "-m", "edgefilter.cli", *map(str, asked)],
+        argv(*asked),
         env=server.environment, cwd=ROOT, capture_output=True, text=True, timeout=120,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

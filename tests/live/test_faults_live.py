@@ -11,7 +11,7 @@ import pytest
 import soundfile
 
 from bench.live import virtual_sound
-from tests.live.test_run_live import ROOT, edgefilter
+from tests.program import ROOT, argv
 
 pytestmark = pytest.mark.slow
 
@@ -21,7 +21,7 @@ class Run:
 
     def __init__(self, server, folder, name):
         self.file, self.json, self.said = folder / f"{name}.wav", folder / f"{name}.json", []
-        command = edgefilter(
+        command = argv(
             "run", "--input", "mic", "--output", self.file, "--engine", "bypass", "--no-learn", "--quiet", "--json", self.json,
         )  # fmt: skip
         self.process = subprocess.Popen(command, env=server.environment, cwd=ROOT, stderr=subprocess.PIPE, text=True)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import soundfile
 
-from tests.live.test_run_live import DEMO, ROOT, edgefilter
 from tests.live.test_virtual_microphone import arrived
+from tests.program import DEMO, ROOT, argv
 
 pytestmark = pytest.mark.slow
 
@@ -39,7 +39,7 @@ def test_the_played_speech_is_the_reference_and_ends_when_the_human_speaks(serve
     )  # fmt: skip
     room = subprocess.Popen(["paplay", "-d", "robot_mic", tmp_path / "noise.wav"], env=server.environment)
     live = subprocess.Popen(
-        edgefilter(
+        argv(
             "run", "--input", "mic", "--play", tmp_path / "robot.wav", "--barge-in", "stop", "--engine", "crnn",
             "--no-learn", "--on-barge-in", f"echo $EDGEFILTER_TIME >> {tmp_path}/noticed", "--seconds", 6,
             "--record", tmp_path / "heard", "--output", tmp_path / "out.wav",

@@ -10,7 +10,7 @@ import soundfile
 from edgefilter.echo.model import EchoModel
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE
 from tests.diagnosis.robot_scene import profile, record, voice
-from tests.live.program import ROOT, edgefilter
+from tests.program import ROOT, argv
 
 pytestmark = pytest.mark.slow
 
@@ -29,7 +29,7 @@ def robot(tmp_path):
 
 def probing(server, folder, *more):
     files = ("--profile", folder / "robot.npz", "--recording", folder / "mic.wav", "--reference", folder / "ref.wav")
-    command = edgefilter("probe", "playback_gain", "chassis_resonance", *files, "--live", "--speaker", "robot", *more)
+    command = argv("probe", "playback_gain", "chassis_resonance", *files, "--live", "--speaker", "robot", *more)
     return subprocess.Popen(
         command, env=server.environment, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )

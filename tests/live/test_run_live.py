@@ -14,7 +14,7 @@ import soxr
 
 from edgefilter import Profile
 from tests.learning.scenes import Scene
-from tests.live.program import DEMO, ROOT, edgefilter
+from tests.program import DEMO, ROOT, argv
 
 pytestmark = pytest.mark.slow
 
@@ -66,7 +66,7 @@ def db(x):
 
 
 def test_live_run_takes_the_monitor_ends_by_ctrl_c_and_equals_the_file_path(server, conversation, tmp_path):
-    command = edgefilter(
+    command = argv(
         "run", "--input", "mic", "--profile", DEMO / "profile.npz", "--output", tmp_path / "live.wav", "--engine", "ss",
         "--record", tmp_path / "heard", "--json", tmp_path / "stats.json", "--no-learn",
     )  # fmt: skip
@@ -81,7 +81,7 @@ def test_live_run_takes_the_monitor_ends_by_ctrl_c_and_equals_the_file_path(serv
     )
     assert stats["samples_in"] == stats["samples_out"] == out.size == mic.size == ref.size
     assert db(mic) > -60 and db(ref) > -60
-    again = edgefilter(
+    again = argv(
         "run", "--input", heard, "--reference", tmp_path / "heard/reference.wav", "--profile", DEMO / "profile.npz",
         "--output", tmp_path / "file.wav", "--engine", "ss", "--no-learn",
     )  # fmt: skip
@@ -100,7 +100,7 @@ def test_live_the_loudspeaker_is_learned_by_another_process_and_remembered(serve
     for sink, sound in (("robot", scene.reference), ("robot_mic", scene.mic)):
         soundfile.write(tmp_path / f"{sink}.wav", sound, 16_000, "PCM_16")
     file = tmp_path / "robot.npz"
-    command = edgefilter(
+    command = argv(
         "run", "--input", "mic", "--output", tmp_path / "live.wav", "--engine", "linear", "--learn", file,
         "--json", tmp_path / "stats.json", "--record", tmp_path / "heard",
     )  # fmt: skip
@@ -115,7 +115,7 @@ def test_live_the_clocks_of_microphone_and_reference_may_differ(server, tmp_path
     scene = Scene(seconds=12.0)
     for sink, sound in (("robot", scene.reference), ("robot_mic", soxr.resample(scene.mic, 1e6 + 300, 1e6))):
         soundfile.write(tmp_path / f"{sink}.wav", sound, 16_000, "PCM_16")
-    command = edgefilter(
+    command = argv(
         "run", "--input", "mic", "--output", tmp_path / "live.wav", "--engine", "linear", "--no-learn",
         "--json", tmp_path / "stats.json", "--record", tmp_path / "heard",
     )  # fmt: skip
@@ -132,11 +132,8 @@ def test_live_the_clocks_of_microphone_and_reference_may_differ(server, tmp_path
 
 def run_for(server, seconds, tmp_path, *more):
     """A live run of so many seconds without a profile, its words and its figures."""
-    command = edgefilter(
-        "run",
-        "--input",
-        "mic",
-        "--output",
+    command = argv(
+        *"run --input mic --output".split(),
         tmp_path / "live.wav",
         "--json",
         tmp_path / "stats.json",
@@ -179,7 +176,7 @@ def test_live_auto_measures_the_engines_and_says_why(server, tmp_path):
 
 def test_an_unknown_device_is_one_line_that_names_the_known_ones(server, tmp_path):
     result = subprocess.run(
-        edgefilter("run", "--input", "nosuchmic", "--output", tmp_path / "x.wav"),
+        argv("run", "--input", "nosuchmic", "--output", tmp_path / "x.wav"),
         env=server.environment,
         cwd=ROOT,
         capture_output=True,
@@ -191,7 +188,7 @@ def test_an_unknown_device_is_one_line_that_names_the_known_ones(server, tmp_pat
 
 
 def test_devices_lists_them_and_the_reference(server):
-    result = subprocess.run(edgefilter("devices"), env=server.environment, cwd=ROOT, capture_output=True, text=True)
+    result = subprocess.run(argv("devices"), env=server.environment, cwd=ROOT, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
     assert "sound server, output  robot_mic" in result.stdout
     assert "robot_mic_monitor" in result.stdout and "take its reference from: robot.monitor" in result.stdout
@@ -199,7 +196,7 @@ def test_devices_lists_them_and_the_reference(server):
 
 def doctor(server, *words):
     """What the doctor found, by the name of the check, and its exit code."""
-    command = edgefilter("doctor", "--json", "-", *words)
+    command = argv("doctor", "--json", "-", *words)
     result = subprocess.run(command, env=server.environment, cwd=ROOT, capture_output=True, text=True)
     found = json.loads(result.stdout)
     assert found["fit"] == (result.returncode == 0), result.stderr
@@ -246,7 +243,7 @@ def test_the_example_that_listens_says_when_somebody_spoke_while_it_runs(server,
     for sink, samples in zip(("robot", "robot_mic"), cut):
         soundfile.write(tmp_path / f"{sink}.wav", samples, 16000, "PCM_16")
     log = tmp_path / "events.jsonl"
-    command = edgefilter("run", "--input", "mic", "--profile", DEMO / "profile.npz", "--output", "-", "--engine", "crnn",
+    command = argv("run", "--input", "mic", "--profile", DEMO / "profile.npz", "--output", "-", "--engine", "crnn",
                          "--no-learn", "--quiet", "--log-json", log)  # fmt: skip
     with subprocess.Popen(
         command, env=server.environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT,

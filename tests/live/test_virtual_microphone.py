@@ -8,7 +8,7 @@ import pytest
 import soundfile
 
 from edgefilter.cli import main
-from tests.live.program import DEMO, ROOT, edgefilter
+from tests.program import DEMO, ROOT, argv
 
 pytestmark = pytest.mark.slow
 
@@ -53,7 +53,7 @@ def test_others_listen_to_the_virtual_microphone_and_the_robot_plays_into_the_vi
         sounds[sink] = sound[max(begins - 8000, 0) :][:40_000]
         soundfile.write(tmp_path / f"{sink}.wav", sounds[sink], 16_000, "PCM_16")
     live = subprocess.Popen(
-        edgefilter(
+        argv(
             "run", "--input", "mic", "--output", "edgefilter_human", "--engine", "bypass", "--seconds", 5,
             "--record", tmp_path / "heard",
         ),
@@ -78,7 +78,7 @@ def test_others_listen_to_the_virtual_microphone_and_the_robot_plays_into_the_vi
     subprocess.run(["pactl", "set-default-source", "edgefilter_mic"], check=True)
     for name in ("mic", "filter mic", "edgefilter_human.monitor"):
         done = subprocess.run(
-            edgefilter("run", "--input", name, "--output", tmp_path / "x.wav"), cwd=ROOT, capture_output=True, text=True
+            argv("run", "--input", name, "--output", tmp_path / "x.wav"), cwd=ROOT, capture_output=True, text=True
         )
         assert done.returncode == 2 and "edgefilter's own output" in done.stderr, done.stderr
     devices("--unload")

@@ -12,6 +12,7 @@ import pytest
 import soundfile
 from PIL import Image
 
+from edgefilter.audio.channels import Channels
 from edgefilter.diagnosis.closer_look import CloserLook, Curve
 from edgefilter.diagnosis.recording import Recording, compare
 from edgefilter.diagnosis.result import Diagnosis, Finding, Interval
@@ -104,12 +105,16 @@ def test_a_range_that_says_nothing_is_not_told():
     assert text.known_parameters(one) == {"threshold": "0.100 full scale, which this recording hardly tells"}
 
 
+RUN = "run --profile p.npz --input m.wav --reference r.wav"
+
+
 @pytest.mark.parametrize(
     ("verdict", "effects", "names", "written", "said"),
     [
         ("missing", ["tilt"], {}, None, "add tilt --profile p.npz --recording m.wav --reference r.wav --output"),
         ("missing", ["tilt"], {}, "new.npz", "run --profile new.npz --input m.wav --reference r.wav --output"),
-        ("explained", [], {"mic_channels": (0, 2)}, None, "run --profile p.npz --input m.wav --reference r.wav --mic-"),
+        ("explained", [], {"mic_channels": Channels([0, 2])}, None, f"{RUN} --mic-channels 0,2 "),
+        ("explained", [], {"mic_channels": Channels()}, None, f"{RUN} --mic-channels all "),
         ("unexplained", [], {}, None, "diagnose --profile p.npz --recording m.wav --reference r.wav --report"),
         ("unexplained", [], {"report": "r.html"}, None, "calibrate --live"),
         ("explained", [], {"profile": None}, None, "calibrate --live"),
@@ -219,7 +224,7 @@ def test_the_command_to_add_is_one_that_a_shell_reads():
         == "edgefilter add tilt --profile 'my robot.npz' --recording m.wav --reference r.wav --effects own.py --output"
         " 'my robot.tilt.npz'"
     )
-    assert add_command(["tilt"], {**names, "mic_channels": (0, 2)}).endswith(
+    assert add_command(["tilt"], {**names, "mic_channels": Channels([0, 2])}).endswith(
         "--effects own.py --mic-channels 0,2 --apply 'my robot.tilt.npz'"
     )
 

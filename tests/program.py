@@ -1,11 +1,15 @@
-"""The command line, in this process or in one of its own, which takes half a second to begin."""
+"""The command line, in this process or in one of its own, which takes half a second to begin; and the bundled sounds."""
 
 import io
 import subprocess
 import sys
 from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
 
 from edgefilter.cli import main
+
+ROOT = Path(__file__).parents[1]
+DEMO = ROOT / "edgefilter/demo_data"
 
 
 def here(*words):
@@ -16,14 +20,14 @@ def here(*words):
     return subprocess.CompletedProcess(words, code, out.getvalue(), error.getvalue())
 
 
-def edgefilter(*arguments, **options):
+def argv(*words):
+    return [sys.executable, "-m", "edgefilter.cli", *map(str, words)]
+
+
+def edgefilter(*words, **options):
     """The program in a process of its own."""
-    return subprocess.run(
-        [sys.executable, "-m", "edgefilter.cli", *map(str, arguments)],
-        capture_output=True,
-        timeout=120,
-        **{"text": "input" not in options, **options},
-    )
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": "input" not in options, "timeout": 120}
+    return subprocess.run(argv(*words), **{**streams, **options})
 
 
 def one_line(result, code, *words):
