@@ -29,30 +29,9 @@ from edgefilter.errors import EdgefilterError, SignalError
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.integrations.doors import complain_briefly, in_one_line
 from edgefilter.integrations.duplex import Pace, as_pcm16, from_pcm16
-from edgefilter.integrations.wire import Decode, Form, TwoStreams, message_of
+from edgefilter.integrations.wire import Decode, Form, Limits, TwoStreams, message_of
 from edgefilter.types import SAMPLE_RATE, SET_UP_WRONG, Event, Samples, SoundFor
 
-MOST_BYTES = 4_000_000
-"""Size of a message: an announced utterance of 40 s at 48 kHz; of sound some 20 ms are usual."""
-PART_S = 0.02
-"""Sound that is filtered before other clients have their turn: what a message usually holds."""
-AHEAD_S, BEHIND_S, TURNS = 0.1, 2.0, 10
-"""Sound that may come before its time, five messages, or after it, what networks hold up, and is filtered at once. What is
-ahead of that waits, one client after the other, until nothing else has been done for so many turns of the event loop: in five a
-message of 20 ms goes all its way."""
-SHARE = 0.5
-"""Of a core's time, what a stream may take at once: whose messages cost more than their sound lasts is ahead of its time as
-one is that sends too much of it. `crnn` takes 0.1 to 0.3."""
-PATIENCE_S, IDLE_S = 5.0, 60.0
-"""Timeouts, s: for the handshake, the first message and the reading of an answer each; and for every later message."""
-READ_AT_ONCE, MOST_FRAMES = 4096, 1000
-"""Bytes that are read of a client before others have their turn, 20 ms of two channels at 48 kHz: in frames without
-content, of 6 bytes, these take 5 ms. And frames of a message, of at least that size where it is of MOST_BYTES."""
-MOST_PINGS, MOST_UNREAD = 100, 1 << 16
-"""Limits that keep a client from filling the memory: pings in a row with no message between them; bytes of answers, those to
-pings among them, that wait for the client to read them."""
-GUESTS = 16
-"""Connections that have no stream yet, or none any more; where one more comes, the oldest of them is cut off."""
 _LOGGER = logging.getLogger(__name__)
 Answer = bytes | str
 
@@ -64,8 +43,8 @@ class Session:
     of the latest message is ahead of its time, or was when it came.
     """
 
-    def __init__(self, form: Form, ego: EgoFilter) -> None:
-        self.form, self.ego = form, ego
+    def __init__(self, form: Form, ego: EgoFilter, limits: Limits) -> None:
+        self.form, self.ego, self._limits = form, ego, limits
         rate, self._now = form.rate, asyncio.get_running_loop().time
         self._to_filter = Resampler(rate, SAMPLE_RATE, form.microphones), Resampler(rate, SAMPLE_RATE)
         self._pace = Pace(self._now)
@@ -81,8 +60,8 @@ class Session:
             from_filter = Resampler(SAMPLE_RATE, rate)
             self._encode = lambda human, last: [as_pcm16(from_filter.push(human, last))]
             codec_s = from_filter.delay_s
-        late, self._part = round(form.late_ms * rate / 1000), round(PART_S * rate)
-        self._two = TwoStreams(*decoders, rate, late) if form.streams == "two" else None
+        late, self._part = round(form.late_ms * rate / 1000), round(limits.part_s * rate)
+        self._two = TwoStreams(*decoders, rate, late, limits) if form.streams == "two" else None
         self.delay_ms = 1000 * (ego.latency / SAMPLE_RATE + self._to_filter[0].delay_s + codec_s)
         self._announced = self.can_wait = self.ended = False
         self._due, self._sound_s = self._now(), 0.0
@@ -96,15 +75,15 @@ class Session:
     def charge(self, spent_s: float) -> None:
         """Count the time of the processor that a part has taken; more work, or sound, than is due can wait from then on."""
         now = self._now()
-        self._due = max(self._due, now - BEHIND_S) + max(self._sound_s, spent_s / SHARE)
+        self._due = max(self._due, now - self._limits.behind_s) + max(self._sound_s, spent_s / self._limits.share)
         self._sound_s = 0.0
-        self.can_wait |= self._due > now + AHEAD_S
+        self.can_wait |= self._due > now + self._limits.ahead_s
 
     def take(self, message: bytes | str) -> Iterator[list[Answer]]:
         """Take a message; what is to be answered, part by part. Raises SignalError for one that is none."""
-        self.can_wait = self._due > self._now() + AHEAD_S
+        self.can_wait = self._due > self._now() + self._limits.ahead_s
         if isinstance(message, str):
-            kind = message_of(message).get("kind")
+            kind = message_of(message, self._limits.text).get("kind")
             if kind == "end":
                 yield from self.finish()
             elif kind != "announce":
@@ -195,8 +174,14 @@ class Service:
     """
 
     def __init__(
-        self, make_filter: Callable[[bool, SoundFor], EgoFilter], streams: int, learners: int, token: str | None
+        self,
+        make_filter: Callable[[bool, SoundFor], EgoFilter],
+        streams: int,
+        learners: int,
+        token: str | None,
+        limits: Limits = Limits(),
     ) -> None:
+        self._limits = limits
         self._make, self._streams, self._learners, self._token = make_filter, streams, learners, token
         self._serving = self._learning = 0
         self._making, self._backlog, self._done = asyncio.Lock(), asyncio.Lock(), 0
@@ -210,21 +195,22 @@ class Service:
         log = _LOGGER.getChild("websockets")
         log.addFilter(in_one_line)
         # a client that sends faster than its messages are filtered is read no faster: two wait here, the others with it
+        limits = self._limits
         waits: dict[str, Any] = {
-            "max_queue": 1,
-            "open_timeout": PATIENCE_S,
-            "close_timeout": PATIENCE_S,
+            "open_timeout": limits.patience_s,
+            "close_timeout": limits.patience_s,
             "ping_interval": None,
         }
-        limits = partial(serve, max_size=MOST_BYTES, compression=None, origins=[None], logger=log, **waits)
-        limits = partial(limits, create_connection=partial(_Connection, self._guests), backlog=GUESTS)
-        async with limits(self._greet, host, port, process_request=self._admit) as server:
+        connection = partial(_Connection, self._guests, limits)
+        listen = partial(serve, max_size=limits.message, max_queue=1, backlog=limits.guests, **waits)
+        listen = partial(listen, compression=None, origins=[None], logger=log, create_connection=connection)
+        async with listen(self._greet, host, port, process_request=self._admit) as server:
             ready(int(next(iter(server.sockets)).getsockname()[1]))
             await self._stopping.wait()
             if ending := [*self._conversing]:
                 for each in ending:
                     each.cancel()
-                await asyncio.wait(ending, timeout=PATIENCE_S)
+                await asyncio.wait(ending, timeout=limits.patience_s)
 
     def stop(self) -> None:
         """Let all streams end in good order; then `run` returns."""
@@ -263,14 +249,14 @@ class Service:
     async def _send_away(self, connection: ServerConnection, why: str) -> None:
         _LOGGER.warning("client %s: %s; its connection is closed", connection.remote_address, why)
         try:
-            await asyncio.wait_for(connection.send(_text("error", detail=why)), PATIENCE_S)
+            await asyncio.wait_for(connection.send(_text("error", detail=why)), self._limits.patience_s)
             _refuse(connection, why)
-            await asyncio.wait_for(connection.wait_closed(), PATIENCE_S)
+            await asyncio.wait_for(connection.wait_closed(), self._limits.patience_s)
         except (ConnectionClosed, TimeoutError, asyncio.TimeoutError):
             connection.transport.abort()
 
     async def _serve(self, connection: ServerConnection) -> None:
-        form = Form.of(await _message(connection, PATIENCE_S))
+        form = Form.of(await _message(connection, self._limits.patience_s, self._limits.frames))
         learns = form.learn and self._learning < self._learners
         self._learning += learns
         ego = None
@@ -279,7 +265,7 @@ class Service:
                 self._making
             ):  # one at a time: several would hold the interpreter's lock and delay the others' sound
                 ego = await asyncio.to_thread(self._make, learns, form.output)
-            session = Session(form, ego)
+            session = Session(form, ego, self._limits)
             await self._send(connection, deque([session.ready(learns)]))
             await self._converse(connection, session)
         except ModuleNotFoundError as error:
@@ -300,7 +286,7 @@ class Service:
             if self._stopping.is_set():
                 raise asyncio.CancelledError
             while not session.ended:
-                work = session.take(await _message(connection, IDLE_S))
+                work = session.take(await _message(connection, self._limits.idle_s, self._limits.frames))
                 await self._work(connection, session, work, answers)
         except asyncio.CancelledError:
             if not self._stopping.is_set():
@@ -330,7 +316,7 @@ class Service:
         if session.can_wait:
             async with self._backlog:
                 quiet = 0
-                while quiet < TURNS:
+                while quiet < self._limits.turns:
                     done = self._done
                     await asyncio.sleep(0)
                     quiet = quiet + 1 if done == self._done else 0
@@ -338,7 +324,7 @@ class Service:
 
     async def _send(self, connection: ServerConnection, answers: deque[Answer]) -> None:
         """Send them in their order; a client that does not read them in time is let go."""
-        slow = asyncio.get_running_loop().call_later(PATIENCE_S, _let_go, connection)
+        slow = asyncio.get_running_loop().call_later(self._limits.patience_s, _let_go, connection)
         try:
             while answers:
                 await connection.send(answers[0])
@@ -350,27 +336,27 @@ class Service:
 class _Connection(ServerConnection):
     """A client's connection, of which a little is read at a time. guests: those without a stream, oldest first."""
 
-    def __init__(self, guests: dict[ServerConnection, None], *args: Any, **more: Any) -> None:
+    def __init__(self, guests: dict[ServerConnection, None], limits: Limits, *args: Any, **more: Any) -> None:
         super().__init__(*args, **more)
-        self._guests, self._pings = guests, 0
+        self._guests, self._limits, self._pings = guests, limits, 0
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         # of asyncio's transports on sockets: 256 kB of frames without content take 0.3 s
-        cast(Any, transport).max_size = READ_AT_ONCE
+        cast(Any, transport).max_size = self._limits.read_at_once
         super().connection_made(transport)
         self._guests[self] = None
-        if len(self._guests) > GUESTS:
+        if len(self._guests) > self._limits.guests:
             next(iter(self._guests)).transport.abort()
 
     def process_event(self, event: Any) -> None:
         super().process_event(event)
         self._pings = self._pings + 1 if getattr(event, "opcode", 0) >= Opcode.CLOSE else 0
-        if self._pings == MOST_PINGS:
-            _refuse(self, f"{MOST_PINGS} pings without a message: send sound")
+        if self._pings == self._limits.pings:
+            _refuse(self, f"{self._pings} pings without a message: send sound")
 
     def data_received(self, data: bytes) -> None:
         super().data_received(data)
-        if self.transport.get_write_buffer_size() > MOST_UNREAD:
+        if self.transport.get_write_buffer_size() > self._limits.unread:
             _let_go(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -378,15 +364,15 @@ class _Connection(ServerConnection):
         super().connection_lost(exc)
 
 
-async def _message(connection: ServerConnection, patience_s: float) -> bytes | str:
+async def _message(connection: ServerConnection, patience_s: float, frames: int) -> bytes | str:
     """The next message; raises SignalError for one in too many frames, and where none comes for so long."""
 
     async def whole() -> bytes | str:
         parts: list[Any] = []
         async for part in connection.recv_streaming():
             parts.append(part)
-            if len(parts) > MOST_FRAMES:
-                raise SignalError(f"a message in more than {MOST_FRAMES} frames, expected fewer: send it in one")
+            if len(parts) > frames:
+                raise SignalError(f"a message in more than {frames} frames, expected fewer: send it in one")
         return type(parts[0])().join(parts)
 
     try:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from edgefilter.errors import SignalError
+from edgefilter.errors import SignalError, UsageError
 from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, Samples, SoundFor
 
 HEADER = struct.Struct("<BxHQ")
@@ -18,15 +18,56 @@ HEADER = struct.Struct("<BxHQ")
 byte, the number of the message in its stream (from 65535 on to 0), and the counter of its first sample; little-endian."""
 RATES = range(8000, 48001)
 """Hz that a device, or a program that calls a canceller, may have: what telephones and sound cards do."""
-JITTER_S = 0.06
-"""For how long a message that is missing is waited for: three of 20 ms."""
-MOST_GAP_S = 10.0
-"""Longest gap that is filled with silence; a counter that jumps further is another stream."""
-MOST_WAITING, MOST_WAITING_BYTES = 64, 16_000_000
-"""Messages of a stream that wait for one that is missing, and references before any microphone: a second of 20 ms. Bytes
-of all that waits: a gap of 10 s of eight microphones at 48 kHz, or a reference that is 83 s ahead of its microphone."""
-MOST_TEXT = 4096
-"""Characters of a message in JSON: a hundred times those of the longest that means something."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How much a client of `edgefilter serve` may make the server hold, wait and compute. UsageError where one is not above 0."""
+
+    message: int = 4_000_000
+    """Bytes of a message: an announced utterance of 40 s at 48 kHz; of sound some 20 ms are usual."""
+    frames: int = 1000
+    """Of a message: of at least `read_at_once` where it is as long as may be."""
+    text: int = 4096
+    """Characters of a message in JSON: a hundred times those of the longest that means something."""
+    read_at_once: int = 4096
+    """Bytes that are read of a client before others have their turn, 20 ms of two channels at 48 kHz: in frames without
+    content, of 6 bytes, these take 5 ms."""
+    part_s: float = 0.02
+    """Sound that is filtered before other clients have their turn: what a message usually holds."""
+    ahead_s: float = 0.1
+    """Sound that may come before its time and is filtered at once, five messages. What is ahead of that waits."""
+    behind_s: float = 2.0
+    """Sound that may come after its time and is filtered at once: what networks hold up."""
+    turns: int = 10
+    """Of the event loop in which nothing else is done before sound that is ahead has its turn, one client after the other: in five a
+    message of 20 ms goes all its way."""
+    share: float = 0.5
+    """Of a core's time, what a stream may take at once: whose messages cost more than their sound lasts is ahead of its time
+    as one is that sends too much of it. `crnn` takes 0.1 to 0.3."""
+    patience_s: float = 5.0
+    """Timeout for the handshake, the first message and the reading of an answer each."""
+    idle_s: float = 60.0
+    """Timeout for every later message."""
+    pings: int = 100
+    """In a row, with no message between them."""
+    unread: int = 1 << 16
+    """Bytes of answers, those to pings among them, that wait for the client to read them."""
+    guests: int = 16
+    """Connections that have no stream yet, or none any more; where one more comes, the oldest of them is cut off."""
+    jitter_s: float = 0.06
+    """For how long a message that is missing is waited for: three of 20 ms."""
+    gap_s: float = 10.0
+    """Longest gap that is filled with silence; a counter that jumps further is another stream."""
+    waiting: int = 64
+    """Messages of a stream that wait for one that is missing, and references before any microphone: a second of 20 ms."""
+    waiting_bytes: int = 16_000_000
+    """Of all that waits: a gap of 10 s of eight microphones at 48 kHz, or a reference that is 83 s ahead of its microphone."""
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            if not value > 0:
+                raise UsageError(f"{name} is {value}, expected more than 0")
 
 
 @dataclass(frozen=True)
@@ -84,15 +125,15 @@ class Form:
         return form
 
 
-def message_of(text: str | bytes) -> dict[str, Any]:
-    """A message in JSON; raises SignalError for what is none."""
+def message_of(text: str | bytes, most: int = Limits.text) -> dict[str, Any]:
+    """A message in JSON of so many characters at most; raises SignalError for what is none."""
     try:
-        found = json.loads(text) if len(text) <= MOST_TEXT else None
+        found = json.loads(text) if len(text) <= most else None
     except (ValueError, RecursionError):
         found = None
     if isinstance(text, bytes) or not isinstance(found, dict):
         raise SignalError(
-            f"found {text[:40]!r}, expected a text message with an object in JSON of {MOST_TEXT} characters at most"
+            f"found {text[:40]!r}, expected a text message with an object in JSON of {most} characters at most"
         )
     return found
 
@@ -103,8 +144,8 @@ class _Order:
     newest: the highest counter so far. bytes: of the sound that waits.
     """
 
-    def __init__(self, jitter: int) -> None:
-        self._jitter = jitter
+    def __init__(self, jitter: int, most: int) -> None:
+        self._jitter, self._most = jitter, most
         self._next: int | None = None
         self._waiting: dict[int, tuple[int, bytes]] = {}
         self.newest = self.bytes = 0
@@ -123,9 +164,9 @@ class _Order:
         if self._waiting and self.newest - min(start for start, _ in self._waiting.values()) > self._jitter:
             self._next = min(self._waiting, key=lambda each: (each - (self._next or 0)) % 65536)
             yield from self._drain(True)
-        if len(self._waiting) > MOST_WAITING:
+        if len(self._waiting) > self._most:
             raise SignalError(
-                f"{len(self._waiting)} messages wait for number {self._next} of their stream, expected {MOST_WAITING} at"
+                f"{len(self._waiting)} messages wait for number {self._next} of their stream, expected {self._most} at"
                 " most: number each stream's messages 0, 1, 2, ..., and count its samples without gaps"
             )
 
@@ -150,10 +191,10 @@ class TwoStreams:
     out; lateness: by how many samples more than allowed the latest of them was.
     """
 
-    def __init__(self, decode_mic: Decode, decode_ref: Decode, rate: int, late: int) -> None:
+    def __init__(self, decode_mic: Decode, decode_ref: Decode, rate: int, late: int, limits: Limits) -> None:
         self._decode_mic, self._decode_ref, self._rate, self._wait = decode_mic, decode_ref, rate, late
-        jitter = round(JITTER_S * rate)
-        self._mic_order, self._ref_order = _Order(jitter), _Order(jitter)
+        self._limits, jitter = limits, round(limits.jitter_s * rate)
+        self._mic_order, self._ref_order = _Order(jitter, limits.waiting), _Order(jitter, limits.waiting)
         self._at: int | None = None
         self._mic, self._ref = decode_mic(b""), np.zeros(0, np.float32)
         self._early: list[tuple[int, Samples]] = []
@@ -171,9 +212,9 @@ class TwoStreams:
         for ready in orders[label].push(number, at, message[HEADER.size :]):
             self._take_ref(*ready) if label else self._take_mic(*ready)
         sound = self._mic.nbytes + self._ref.nbytes + sum(part.nbytes for _, part in self._early)
-        if (waiting := sound + self._mic_order.bytes + self._ref_order.bytes) > MOST_WAITING_BYTES:
+        if (waiting := sound + self._mic_order.bytes + self._ref_order.bytes) > self._limits.waiting_bytes:
             raise SignalError(
-                f"{waiting} bytes wait for messages that are missing, expected {MOST_WAITING_BYTES} at most: number each"
+                f"{waiting} bytes wait for messages that are missing, expected {self._limits.waiting_bytes} at most: number each"
                 " stream's messages 0, 1, 2, ..., and do not send the reference ahead of the microphone"
             )
 
@@ -208,7 +249,7 @@ class TwoStreams:
         self._ref_end = max(self._ref_end, at + samples.size)
         if self._at is None:
             self._early.append((at, samples))
-            del self._early[:-MOST_WAITING]
+            del self._early[: -self._limits.waiting]
         else:
             self._place(at, samples)
 
@@ -228,7 +269,7 @@ class TwoStreams:
         self._ref = np.concatenate((self._ref, samples[known:]))
 
     def _check_gap(self, gap: int) -> None:
-        if abs(gap) > MOST_GAP_S * self._rate:
+        if abs(gap) > self._limits.gap_s * self._rate:
             raise SignalError(
-                f"a counter jumps by {gap / self._rate:.1f} s, expected {MOST_GAP_S:.0f} s at most: begin a new connection"
+                f"a counter jumps by {gap / self._rate:.1f} s, expected {self._limits.gap_s:.0f} s at most: begin a new connection"
             )

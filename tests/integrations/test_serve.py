@@ -26,10 +26,10 @@ import edgefilter
 from edgefilter import EgoFilter, SignalError, enhance
 from edgefilter.cli import main
 from edgefilter.dsp.metrics import si_sdr
-from edgefilter.integrations import serve as module
+from edgefilter.errors import UsageError
 from edgefilter.integrations.opus import Decoder, Encoder
 from edgefilter.integrations.serve import Service
-from edgefilter.integrations.wire import HEADER, MOST_WAITING_BYTES, Form, TwoStreams
+from edgefilter.integrations.wire import HEADER, Form, Limits, TwoStreams
 from tests.program import argv
 
 ROOT = Path(__file__).parents[2]
@@ -55,9 +55,10 @@ def as_float(data):
 
 
 @asynccontextmanager
-async def serving(engine="crnn", profile=DEMO / "profile.npz", streams=4, token=None):
+async def serving(engine="crnn", profile=DEMO / "profile.npz", streams=4, token=None, **limits):
     """The address of a service, which is ended afterwards."""
-    service = Service(lambda learns, output: EgoFilter(profile, engine=engine, output=output), streams, 0, token)
+    make = lambda learns, output: EgoFilter(profile, engine=engine, output=output)  # noqa: E731
+    service = Service(make, streams, 0, token, Limits(**limits))
     async with served(service) as address:
         yield address
 
@@ -330,7 +331,7 @@ def test_a_message_that_cannot_be_read_ends_its_connection_and_no_other(form, me
 
 def two_streams(late=0):
     """At 1000 samples a second, whose sound is float32."""
-    return TwoStreams(*(lambda sound: np.frombuffer(sound, np.float32),) * 2, 1000, late)
+    return TwoStreams(*(lambda sound: np.frombuffer(sound, np.float32),) * 2, 1000, late, Limits())
 
 
 SAID = np.random.default_rng(0).standard_normal(4000).astype(np.float32)
@@ -452,15 +453,13 @@ def test_without_the_token_nobody_is_let_in_and_no_web_page_is():
     assert run(talk()) == [401, 401, "ready"] and run(page()) == 403
 
 
-def test_a_message_that_is_too_large_is_not_read(monkeypatch):
-    monkeypatch.setattr(module, "MOST_BYTES", 10_000)
-
+def test_a_message_that_is_too_large_is_not_read():
     async def talk():
-        async with serving("linear") as address, connect(address, max_size=None) as server:
+        async with serving("linear", message=10_000) as address, connect(address, max_size=None) as server:
             await server.send("{}")
             await server.recv()
             with pytest.raises(ConnectionClosed):
-                await server.send(b"\0" * (module.MOST_BYTES + 4))
+                await server.send(b"\0" * 10_004)
                 while True:
                     await server.recv()
             return server.close_code
@@ -469,11 +468,9 @@ def test_a_message_that_is_too_large_is_not_read(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_client_that_does_not_read_is_let_go_and_others_go_on(monkeypatch, caplog):
-    monkeypatch.setattr(module, "PATIENCE_S", 0.5)
-
+def test_a_client_that_does_not_read_is_let_go_and_others_go_on(caplog):
     async def talk():
-        async with serving("bypass", profile=None) as address:
+        async with serving("bypass", profile=None, patience_s=0.5) as address:
             slow = await connect(address, max_queue=1, write_limit=1 << 16)
             await slow.send(json.dumps({"rate": 48000}))
             block = pcm(np.zeros((48000, 2)))
@@ -507,14 +504,17 @@ def test_a_client_that_vanishes_leaves_its_place_and_comes_back():
     assert run(talk()) == "ended"
 
 
-def test_a_client_that_says_nothing_is_let_go(monkeypatch):
-    monkeypatch.setattr(module, "PATIENCE_S", 0.2)
-
+def test_a_client_that_says_nothing_is_let_go():
     async def talk():
-        async with serving("linear") as address, connect(address) as server:
+        async with serving("linear", patience_s=0.2) as address, connect(address) as server:
             return json.loads(await server.recv())["detail"]
 
     assert "no message came" in run(talk())
+
+
+def test_limits_are_above_zero():
+    with pytest.raises(UsageError, match="idle_s is 0, expected more than 0"):
+        Limits(idle_s=0)
 
 
 def skipping(step, size):
@@ -578,7 +578,7 @@ def test_a_client_whose_messages_would_fill_the_memory_is_told_and_what_it_sent_
 
     told, most, left = run(talk())
     assert told[-1]["kind"] == "error" and words in told[-1]["detail"]
-    assert most < 6 * MOST_WAITING_BYTES  # with this client's side of the connection
+    assert most < 6 * Limits.waiting_bytes  # with this client's side of the connection
     assert left is None
 
 
@@ -622,7 +622,7 @@ def test_beside_clients_that_send_4_MB_at_once_a_stream_in_real_time_is_filtered
             assert len(filters) == 1 + clients and not any(each.done() for each in floods)
             for each in floods:
                 each.cancel()
-        return np.array(between) / (module.PART_S * RATE), [each.taken for each in filters[1:]]
+        return np.array(between) / (Limits.part_s * RATE), [each.taken for each in filters[1:]]
 
     between, taken = run(talk())
     assert np.median(between) <= 1 and np.percentile(between, 90) <= 4
@@ -736,15 +736,13 @@ def test_connections_that_say_nothing_give_way_and_a_client_is_served_among_them
             return kinds(told)[-1], still
 
     said, still = run(talk())
-    assert said == "ended" and 0 < still <= module.GUESTS
+    assert said == "ended" and 0 < still <= Limits.guests
     assert not any(record.exc_info or "\n" in record.getMessage() for record in caplog.records)
 
 
-def test_a_client_that_falls_silent_for_good_is_told_and_leaves_its_place(monkeypatch):
-    monkeypatch.setattr(module, "IDLE_S", 0.3)
-
+def test_a_client_that_falls_silent_for_good_is_told_and_leaves_its_place():
     async def talk():
-        async with serving("linear", streams=1) as address, connect(address) as server:
+        async with serving("linear", streams=1, idle_s=0.3) as address, connect(address) as server:
             await server.send("{}")
             await server.recv()
             told = json.loads(await server.recv())
