@@ -258,11 +258,11 @@ def pooled(rows: Iterable[Mapping], above: str, below: str) -> dict | None:
     return {"mean": float(100 * top.sum() / bottom.sum()), "low": low, "high": high, "count": int(bottom.sum())}
 
 
-def difference(rows: Iterable[Mapping], others: Iterable[Mapping], key: str, same: str = "clip") -> dict | None:
+def difference(rows: Iterable[Mapping], others: Iterable[Mapping], key: str) -> dict | None:
     """By how much a figure is above that of other rows on the same clips, with its paired interval."""
     (kept, mine), (theirs, known) = values(rows, key), values(others, key)
-    of = {row[same]: value for row, value in zip(theirs, known, strict=True)}
-    both = [(row, value - of[row[same]]) for row, value in zip(kept, mine, strict=True) if row[same] in of]
+    of = {row["clip"]: value for row, value in zip(theirs, known, strict=True)}
+    both = [(row, value - of[row["clip"]]) for row, value in zip(kept, mine, strict=True) if row["clip"] in of]
     return mean([{**row, key: value} for row, value in both], key)
 
 

@@ -11,14 +11,14 @@ import numpy as np
 from edgefilter.audio.pairing import BUFFER_S
 from edgefilter.audio.port import START_S, InputPort, SpokenReference, clock
 from edgefilter.audio.protocols import Sink
-from edgefilter.audio.sample_clock import HELD_S, SampleClock
+from edgefilter.audio.sample_clock import Lateness, SampleClock
 from edgefilter.errors import DeviceError
 from edgefilter.types import SAMPLE_RATE, Samples
 
 RETRY_S = 1.0
 """Between two attempts to open a device that is away."""
-LOOK_S = 0.5
-"""How long a small delay must last to count as lost sound: longer than callbacks are late on a busy machine."""
+LATENESS = Lateness(look_s=0.5)
+"""Longer than callbacks are late on a busy machine."""
 
 
 class SteadyInput:
@@ -34,7 +34,7 @@ class SteadyInput:
         self.port = make()
         self.filled = self.gone = self.back = 0
         self._earlier_lost = self._earlier_overruns = 0
-        self._open, self._clock = False, SampleClock(LOOK_S)
+        self._open, self._clock = False, SampleClock(LATENESS)
         self._failure: DeviceError | None = None
         self._latest = np.zeros(0, np.float32)
         self._received_at = self._gone_at = self._tried_at = 0.0
@@ -57,7 +57,7 @@ class SteadyInput:
     @property
     def doubts(self) -> bool:
         """Whether sound is late, so that it is not clear yet what was lost."""
-        return self._clock.doubt_s > HELD_S or clock() - self._received_at > HELD_S
+        return self._clock.doubts or clock() - self._received_at > LATENESS.held_s
 
     @property
     def missed(self) -> int:

@@ -58,9 +58,9 @@ class Moments(NamedTuple):
         """These, followed by those of the next hop."""
         return Moments(*(MEMORY * before + (1.0 - MEMORY) * new for before, new in zip(self, now)))
 
-    def plus(self, now: Moments, keep: float = 1.0) -> Moments:
-        """The sums of both, of these keep times as much."""
-        return Moments(*(keep * before + new for before, new in zip(self, now)))
+    def plus(self, now: Moments) -> Moments:
+        """The sums of both."""
+        return Moments(*(before + new for before, new in zip(self, now)))
 
     def scaled(self, factor: float) -> Moments:
         """Those of an echo that is factor times this one."""

@@ -20,7 +20,7 @@ import numpy as np
 from edgefilter.audio.channels import Channels
 from edgefilter.audio.pairing import Pairing
 from edgefilter.audio.raw import delivered, of_pcm16, to_pcm16
-from edgefilter.audio.sample_clock import HELD_S, SampleClock
+from edgefilter.audio.sample_clock import Lateness, SampleClock
 from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import UsageError
 from edgefilter.filter.barge_in import BargeInSettings
@@ -314,10 +314,10 @@ class Duplex:
         self._held = False
         if self._paused or (at_s is not None) != self._timed:
             self._timed = at_s is not None
-            self._losses = SampleClock(0.0) if self._timed else SampleClock()
+            self._losses = SampleClock(Lateness(look_s=0.0)) if self._timed else SampleClock()
         elif waited or at_s is not None:
             lost_s = self._losses.note(self._delivered_s, now if at_s is None else at_s + heard_s)
-            self._held = self._talking and self._losses.doubt_s > HELD_S
+            self._held = self._talking and self._losses.doubts
             if lost_s > 0.0:
                 count = round(min(lost_s, max(now - self._talking_since, 0.0)) * SAMPLE_RATE)
                 skipped = self._pairing.skip(min(count, self._pairing.queued))[-round(FILLED_S * SAMPLE_RATE) :]

@@ -101,7 +101,7 @@ class CandidatePath:
 
 
 class PathLearner:
-    """Learns from every hop that it is given, and answers with a update where a better path is found.
+    """Learns from every hop that it is given, and answers with an update where a better path is found.
 
     Parameters
     ----------

@@ -13,7 +13,7 @@ from edgefilter.audio.files import FileSink, FileSource
 from edgefilter.audio.live import LiveSink, LiveSource
 from edgefilter.audio.pairing import TOLERANCE
 from edgefilter.audio.protocols import Troubles
-from edgefilter.audio.sample_clock import SampleClock
+from edgefilter.audio.sample_clock import Lateness, SampleClock
 from edgefilter.audio.steady import SteadySink
 from edgefilter.cli import main
 from edgefilter.commands.run import check_output, limited
@@ -271,6 +271,13 @@ def test_patience_that_is_over_ends_the_run_with_what_was_heard(both, tmp_path):
     report, _, heard = run(LiveSource("mic", "ref", patience_s=5.0), tmp_path / "x.wav")
     assert isinstance(report.failure, DeviceError) and "'mic' stopped" in str(report.failure)
     assert heard.size == report.samples_in and np.count_nonzero(heard) == pytest.approx(3.8 * 16000, abs=0.1 * 16000)
+
+
+def test_a_clock_that_would_count_everything_as_lost_is_refused():
+    assert Lateness(look_s=0.0).look_s == 0.0
+    for name in ("stall_s", "held_s"):
+        with pytest.raises(UsageError, match=f"{name} is 0.0, expected more than 0"):
+            Lateness(**{name: 0.0})
 
 
 @pytest.mark.parametrize("ppm", [300, -300])

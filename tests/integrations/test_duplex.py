@@ -447,8 +447,8 @@ def test_bytes_become_one_channel_and_back():
 def test_the_robot_is_removed_though_its_speech_comes_in_bursts_is_cut_off_and_begins_again(room_of):
     """At other rates than the filter's; the loudspeaker drops what it holds when the speech is cut off."""
     room = room_of.Room()
-    events = []
-    duplex = Duplex(EgoFilter(room_of.PROFILE, engine="crnn"), on_event=events.append)
+    events, step = [], 0
+    duplex = Duplex(EgoFilter(room_of.PROFILE, engine="crnn"), on_event=events.append, clock=lambda: 0.02 * step)
     heard, filtered = [], []
     for step in range(300):
         if step in (0, 150):
