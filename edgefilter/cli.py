@@ -53,6 +53,14 @@ CONFIRM = {
 }
 
 
+ASK = {
+    "type": lambda text: number(0.0, 40.0, "0 to 40 dB", closed=True)(text),
+    "default": BargeInSettings.ask_db,
+    "metavar": "DB",
+    "help": "lower the robot's voice by so much while the human may have begun to speak, to hear who it was (default: %(default)g)",
+}
+
+
 JSON = {"metavar": "FILE", "help": "write the figures as JSON ('-': standard output)"}
 REPORT = {"metavar": "R.html", "help": "write a page with pictures and sound, in one file"}
 FORCE = {"action": "store_true", "help": "write the profile even if the running filter is worse with it"}
@@ -144,6 +152,7 @@ def _run(commands: argparse._SubParsersAction) -> None:
     option("--speaker", metavar="DEVICE", help="output device for --play (default: default)")
     told = "when the human begins to speak, end what --play plays, or lower it by 10 dB until the human is quiet"
     option("--barge-in", choices=("stop", "duck"), help=told)
+    option("--ask-db", **ASK)
     learning = run.add_mutually_exclusive_group()
     told = "start from what earlier runs have learned if the file exists (else from --profile), and keep there what this one learns"
     learning.add_argument("--learn", metavar="P.npz", help=told)

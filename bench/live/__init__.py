@@ -33,6 +33,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--one-way", action="store_true", help="soak: the reference's clock is fast all the time")
     uninterrupted = "barge-in: voices of robots that nobody interrupts"
     add("--alone", type=Path, nargs="*", default=[], metavar="DIR", help=uninterrupted)
+    add(
+        "--ask-db",
+        type=float,
+        default=0.0,
+        metavar="DB",
+        help="barge-in: by how much a robot lowers its voice that is asked to",
+    )
     add("--real", type=Path, metavar="DIR", help="barge-in: recordings of a real loudspeaker alone")
 
 

@@ -10,7 +10,8 @@ sound. The recogniser gets the human's span of what each of them leaves.
 Backchannels: the same scenes, with a short word or a cough in the place of the interruption. False stops: the robot
 alone for --minutes of its speech (--alone: its voices), in new rooms all the time, half of them with loudspeakers of
 strong distortion and half without a calibration, and recordings of a real loudspeaker (--real) that nothing was tuned
-on. Rows are kept in --cache as they are made: a run that was cut off, or is asked for more minutes, goes on there.
+on. --ask-db: interruptions and false stops with a robot that lowers its voice where the filter asks for it. Rows are kept
+in --cache as they are made: a run that was cut off, or is asked for more minutes, goes on there.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import cycle, islice
 from pathlib import Path
+from typing import NamedTuple
 
 import jiwer
 import numpy as np
@@ -48,6 +50,7 @@ from bench.simulate.conversations import Scene, make_scene, read_clips, read_voi
 from bench.simulate.robot_day import STARTS, Monologue, make_monologue
 from bench.systems import Output
 from edgefilter import EgoFilter
+from edgefilter.audio.fade import Fade
 from edgefilter.calibration.calibrate import calibrate
 from edgefilter.filter.barge_in import BargeIn, BargeInSettings
 from edgefilter.profile.data import Profile
@@ -82,25 +85,48 @@ POLICIES = {
 SHORT = {"word": "a word of 0.3-0.5 s", "cough": "a cough"}
 
 
-def listen(mic: Samples, ref: Samples, profile: Profile | None, engine: str) -> Output:
-    ego, probability, done = EgoFilter(profile, engine=engine), [], []
+class Robot(NamedTuple):
+    """A robot that lowers its voice by ask_db where the filter asks for it.
+
+    echo: of the microphone, (n,), what it says; late: samples by which that is later than in the reference.
+    """
+
+    echo: Samples
+    late: int
+    ask_db: float
+
+
+def listen(mic: Samples, ref: Samples, profile: Profile | None, engine: str, robot: Robot | None = None) -> Output:
+    """The filter over a recording, or in a closed loop with a robot that asks."""
+    ask_db = robot.ask_db if robot else 0.0
+    ego, probability, done = EgoFilter(profile, engine=engine, barge_in=BargeInSettings(ask_db=ask_db)), [], []
     mic, ref = mic.astype(np.float32), ref.astype(np.float32)
+    fade, gains = Fade(), np.ones(mic.size, np.float32)
     for at in range(0, mic.size, ego.hop):
-        done.append(ego.process(mic[at : at + ego.hop], ref[at : at + ego.hop]))
+        block = slice(at, min(at + ego.hop, mic.size))
+        heard = mic[block]
+        if robot:
+            fade.wanted = ego.playback_gain
+            gains[block] = fade.apply(gains[block], SAMPLE_RATE)
+            then = np.arange(block.start, block.stop) - robot.late
+            heard = heard + (np.where(then < 0, 1.0, gains[then]) - 1.0).astype(np.float32) * robot.echo[block]
+        done.append(ego.process(heard, gains[block] * ref[block]))
         probability.append(ego.speech_probability)
-    events = [event for event in ego.events() if event.kind.startswith("speech")]
+    events = [event for event in ego.events() if event.kind.startswith(("speech", "playback"))]
     return Output(np.concatenate((*done, ego.flush())), events, probability, ego.hop)
 
 
-def measure(scene: Scene, engine: str, recogniser: Recogniser | None) -> dict:
+def measure(scene: Scene, engine: str, recogniser: Recogniser | None, ask_db: float) -> dict:
     """Ready for JSON: noticed with a calibration and without, words under each policy, backchannels."""
     signals, meta = scene.signals, scene.meta
     ref, onset = signals["ref"], first_sound(signals["clean"].astype(np.float32))
     profile = calibrate(*(signals[name].astype(np.float32) for name in CALIBRATION))
-    talk = listen(signals["mic"], ref, profile, engine)
+    late = meta.get("lag2", meta["lag"]) + meta["delay"]  # of the second utterance, which is interrupted
+    robot = Robot(scene.echo(ref).astype(np.float32), late, ask_db)
+    talk = listen(signals["mic"], ref, profile, engine, robot)
     row = {name: meta[name] for name in ("room", "voice", "speaker", "text", "sisdr_mix")}
     row["calibrated"] = when(talk, onset)
-    row["cold"] = when(listen(signals["mic"], ref, None, engine), onset)
+    row["cold"] = when(listen(signals["mic"], ref, None, engine, robot), onset)
     row["short"] = {kind: when(backchannel(scene, kind, profile, engine, onset), onset) for kind in SHORT}
     if recogniser:
         row["words"] = policies(scene, talk, profile, engine, onset, recogniser)
@@ -214,7 +240,9 @@ def early_errors(spoken: Sequence[str], recognised: Sequence[str], first: int) -
     return errors
 
 
-def monologues(folders: list[Path], minutes: float, seed: int, engine: str, kept: Cache, of: object) -> list[dict]:
+def monologues(
+    folders: list[Path], minutes: float, seed: int, engine: str, ask_db: float, kept: Cache, of: object
+) -> list[dict]:
     """A row for each robot, until they have spoken for so many minutes; each voice goes on where it stopped."""
     voices = read_voices(folders) if folders else {}
     order = np.random.default_rng(seed)
@@ -226,15 +254,16 @@ def monologues(folders: list[Path], minutes: float, seed: int, engine: str, kept
         own = islice(cycle(clips[voice]), taken[voice], None)
 
         def made(index: int = index, voice: str = voice, own: object = own) -> dict:
-            return monologue(make_monologue(seed, index, voice, own, length), engine)
+            return monologue(make_monologue(seed, index, voice, own, length), engine, ask_db)
 
         rows.append(kept.get(made, of, "monologue", index, length))
         taken[voice] += len(rows[-1]["said"])
     return rows
 
 
-def monologue(made: Monologue, engine: str) -> dict:
-    talk = listen(made.mic, made.ref, calibrate(*made.calibration) if made.start == "calibrated" else None, engine)
+def monologue(made: Monologue, engine: str, ask_db: float) -> dict:
+    profile = calibrate(*made.calibration) if made.start == "calibrated" else None
+    talk = listen(made.mic, made.ref, profile, engine, Robot(made.echo, made.late, ask_db))
     said = [[f"{clip.path.parent.name}/{clip.path.stem}", seconds] for clip, seconds in made.said]
     of = {key: getattr(made, key) for key in ("room", "distortion", "start", "voice")}
     return of | {"said": said} | stops(talk, sum(seconds for _, seconds in said))
@@ -257,7 +286,8 @@ def real_minutes(folder: Path, engine: str) -> list[dict]:
 def stops(talk: Output, speech_s: float) -> dict:
     """How often the robot was stopped by itself, and how often it would have been at each of THRESHOLDS."""
     at_each = [starts(replay(talk.probability, talk.hop, at)) for at in THRESHOLDS]
-    return {"speech_s": speech_s, "stops": starts(talk.events), "stops_at": at_each}
+    asked = sum(event.kind == "playback_gain" and float(event.detail) < 1.0 for event in talk.events)
+    return {"speech_s": speech_s, "stops": starts(talk.events), "stops_at": at_each, "asked": asked}
 
 
 def run(options: argparse.Namespace) -> str:
@@ -268,23 +298,32 @@ def run(options: argparse.Namespace) -> str:
     recogniser = Recogniser(options.whisper, Cache(options.cache)) if options.whisper else None
     kept = Cache(options.cache, "barge_in")
     sources = [entry["sha256"] for entry in made_with["data"]]
-    of = (engine, options.seed, made_with["judged"], sources, recogniser.identity if recogniser else None)
+    of = (
+        engine,
+        options.ask_db,
+        options.seed,
+        made_with["judged"],
+        sources,
+        recogniser.identity if recogniser else None,
+    )
     speech, voices = read_clips(options.speech, (3.0, 12.0)), read_voices(options.voices)
     rows = []
     for index in progress(range(options.count), "conversation"):
 
         def made(index: int = index) -> dict:
             scene = make_scene(options.seed, index, KINDS[index // 2 % 2], speech, voices)
-            return measure(scene, engine, recogniser)
+            return measure(scene, engine, recogniser, options.ask_db)
 
         rows.append(kept.get(made, of, "conversation", index))
-    alone = monologues(options.alone, options.minutes, options.seed, engine, kept, of)
+    alone = monologues(options.alone, options.minutes, options.seed, engine, options.ask_db, kept, of)
     alone += real_minutes(options.real, engine) if options.real else []
     points = {start: curve([row[start] for row in rows], alone, start) for start in STARTS}
     lines = {start: ([p["per_hour"] for p in of], [100 * p["in_time"] for p in of]) for start, of in points.items()}
     panel = results.panel(f"threshold {THRESHOLDS[0]} to {THRESHOLDS[-1]}", "false stops an hour of robot speech",
                           f"noticed within {IN_TIME_S} s, %", lines, "o-", ylim=(0, 102))  # fmt: skip
     notes = f"Engine `{engine}`, default threshold. Humans 20-28 dB below the robot that talks meanwhile."
+    if options.ask_db:
+        notes += f" The robot asks: it lowers its voice by {options.ask_db:g} dB, the real recordings apart."
     return results.write(
         options.output, "barge_in", "Barge-in in closed loop", made_with, tables(rows, alone, points),
         [results.plot("barge_in", [panel])], notes, engine=engine, conversations=rows, alone=alone, curve=points,
@@ -304,7 +343,8 @@ def tables(rows: Sequence[Mapping], alone: Sequence[Mapping], points: Mapping[st
                       "Open loop, calibrated, speech ended by 0.2 s of silence. The words are cut from the humans' first"
                       " syllables, the coughs are bursts of noise: stand-ins, not recordings of either."),
         results.table("false-stops", "False stops",
-                      ["loudspeaker, filter", "robots", ("minutes of speech", 1), ("distinct", 1), "voices", "stops", ("an hour", 1)],
+                      ["loudspeaker, filter", "robots", ("minutes of speech", 1), ("distinct", 1), "voices", "stops", ("an hour", 1),
+                       "asked"],
                       [[name, *false_stops(part)] for name, part in groups(alone).items() if part]),
         results.table("threshold", "By the threshold of the probability, simulated robots",
                       ["filter", "threshold", (f"within {IN_TIME_S} s, %", 0), ("false stops an hour", 1)],
@@ -350,10 +390,11 @@ def synthesiser(voice: str) -> str:
 
 
 def false_stops(rows: Sequence[Mapping]) -> list:
-    """Robots, minutes of speech and of distinct speech, voices, stops, and stops an hour with the exact Poisson interval."""
+    """Robots, minutes of speech and of distinct speech, voices, stops, stops an hour with the exact Poisson interval, and how often it asked."""
     hours, count = sum(row["speech_s"] for row in rows) / 3600, sum(row["stops"] for row in rows)
     distinct_s = sum({name: seconds for row in rows for name, seconds in row["said"]}.values())
-    return [len(rows), 60 * hours, distinct_s / 60, len({row["voice"] for row in rows}), count, per_hour(count, hours)]
+    return [len(rows), 60 * hours, distinct_s / 60, len({row["voice"] for row in rows}), count, per_hour(count, hours),
+            sum(row["asked"] for row in rows)]  # fmt: skip
 
 
 def curve(found: Sequence[Mapping], alone: Sequence[Mapping], start: str) -> list[dict]:

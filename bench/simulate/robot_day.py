@@ -207,12 +207,14 @@ TRIAL_S = 6.0
 class Monologue:
     """One robot in one room, from the filter's first moment on.
 
-    ref, mic: (n,) float32. start: whether the filter has the calibration (sweep, its recording, the fan). said: clips
-    in order, and how many seconds each.
+    ref, mic: (n,) float32. echo: of mic, what the robot says; late: samples by which it is later than in ref. start: whether
+    the filter has the calibration (sweep, its recording, the fan). said: clips in order, and how many seconds each.
     """
 
     ref: Samples
     mic: Samples
+    echo: Samples
+    late: int
     calibration: tuple[Samples, Samples, Samples]
     room: str
     distortion: str
@@ -235,6 +237,7 @@ def make_monologue(seed: int, index: int, voice: str, clips: Iterator[Clip], spe
     said = Repertoire(chain([first], clips))
     ref, echo, heard = speak(rng, robot, said, stage, speech_s)
     microphone = draw_microphone(rng, robot, room, float(np.abs(echo).max()), loudness(echo, heard))
-    mic = (microphone.gain * echo).astype(np.float32) + microphone.hears_fan(rng, ref.size)
-    sweeps = calibration(rng, robot, room, microphone)
-    return Monologue(ref.astype(np.float32), mic, sweeps, kind, distortion, start, voice, said.said)
+    heard = (microphone.gain * echo).astype(np.float32)
+    mic = heard + microphone.hears_fan(rng, ref.size)
+    sweeps, late = calibration(rng, robot, room, microphone), stage.lag + robot.bulk
+    return Monologue(ref.astype(np.float32), mic, heard, late, sweeps, kind, distortion, start, voice, said.said)

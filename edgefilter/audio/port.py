@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from edgefilter.audio.channels import Channels
+from edgefilter.audio.fade import Fade
 from edgefilter.audio.pairing import BUFFER_S, Inlet, Outlet
 from edgefilter.audio.pulse import OPENING, Device, leading_to
 from edgefilter.audio.raw import delivered
@@ -31,8 +32,6 @@ START_S = 6.0
 """How long a device may take to its first samples: a virtual one can hold back its first 2 s."""
 STREAM_LATENCY_S = 0.05
 """Buffer asked of the sound system for live use, three hops: it is part of the latency."""
-FADE_S = 0.02
-"""How long a change of the gain by one takes: short for an ear, too long for a click."""
 
 
 def clock() -> float:
@@ -229,12 +228,11 @@ class SpokenReference(Port):
         self._ring = Ring(round(BUFFER_S * self.rate))
         self._pieces = self._converted(speech)
         self._back = Resampler(self.rate, SAMPLE_RATE)
-        self._gain = self._wanted = 1.0
-        self._step = 1.0 / (FADE_S * self.rate)
+        self._fade = Fade()
 
     def fade(self, gain: float) -> None:
         """Go on with this gain; with 0 the rest of the speech is passed over in silence."""
-        self._wanted = gain
+        self._fade.wanted = gain
 
     def open(self) -> None:
         """Start the stream, silent at first."""
@@ -257,12 +255,7 @@ class SpokenReference(Port):
         played = np.zeros(count, np.float32)
         speech = self._ring.read(count)
         played[: speech.size] = speech
-        if self._gain != 1.0 or self._wanted != 1.0:
-            reach = self._step * np.arange(1, count + 1)
-            gains = self._gain + np.clip(self._wanted - self._gain, -reach, reach)
-            self._gain = float(gains[-1])
-            played *= gains.astype(np.float32)
-        return played
+        return self._fade.apply(played, self.rate)
 
     def _converted(self, speech: Iterator[Samples]) -> Iterator[Samples]:
         """The speech at the device's rate, in pieces of a quarter of the ring, which is half full when one is added."""

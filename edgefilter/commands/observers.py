@@ -188,12 +188,19 @@ class EventCommand:
                 process.kill()
 
 
-def lower(speech: SpokenReference, how: str, event: Event) -> None:
-    """End the robot's speech at an interruption, or lower it by 10 dB for as long as the human speaks; how: a word of LOWERED."""
-    if event.kind in INTERRUPTIONS:
-        speech.fade(LOWERED[how])
-    elif event.kind == "speech_stopped" and how == "duck":
-        speech.fade(1.0)
+class Lowering:
+    """Ends or lowers what the robot says while the human speaks, as a word of LOWERED says, and where the filter asks for it."""
+
+    def __init__(self, speech: SpokenReference, ego: EgoFilter, how: str | None) -> None:
+        self._speech, self._ego, self._how, self._gain = speech, ego, how, 1.0
+
+    def hear(self, event: Event) -> None:
+        """Follow an event."""
+        if self._how and event.kind in INTERRUPTIONS:
+            self._gain = LOWERED[self._how]
+        elif self._how == "duck" and event.kind == "speech_stopped":
+            self._gain = 1.0
+        self._speech.fade(min(self._gain, self._ego.playback_gain))
 
 
 class Availability:
@@ -255,8 +262,8 @@ def observing(
     """All who are told of the run that the arguments ask for; notes: what the user was told before it."""
     told = Observers()
     with ExitStack() as stack:
-        if args.barge_in and speech:
-            told.of_events.append(partial(lower, speech, args.barge_in))
+        if speech and (args.barge_in or args.ask_db):
+            told.of_events.append(Lowering(speech, ego, args.barge_in).hear)
         commands = ("--on-barge-in", INTERRUPTIONS, args.on_barge_in), ("--on-suspicion", SUSPICIONS, args.on_suspicion)
         for option, kinds, command in commands:
             if command:

@@ -98,8 +98,8 @@ def check_output(name: str) -> None:
 def make_speech(args: argparse.Namespace) -> SpokenReference | None:
     """The speech that the run itself plays, None where no --play asks for it."""
     if args.play is None:
-        if args.speaker is not None or args.barge_in:
-            option = "--barge-in" if args.barge_in else "--speaker"
+        given = {"--speaker": args.speaker, "--barge-in": args.barge_in, "--ask-db": args.ask_db or None}
+        if option := next((option for option, value in given.items() if value is not None), None):
             raise UsageError(f"{option} concerns the speech that --play plays, found none: give --play FILE")
         return None
     live = is_device(args.input)
@@ -195,7 +195,7 @@ def make_filter(args: argparse.Namespace, live: bool, profile: Profile | None) -
         engine=engine,
         budget_ms=budget_ms if live else None,
         model=args.model,
-        barge_in=BargeInSettings(confirm_s=args.confirm_s),
+        barge_in=BargeInSettings(confirm_s=args.confirm_s, ask_db=args.ask_db),
         learn=make_learner(args, live, profile),
         output=args.sound,
     )

@@ -13,9 +13,9 @@ from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.budget import allowed_cores
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.integrations.doors import is_own
+from edgefilter.integrations.wire import Form
 from edgefilter.learning.background import BackgroundLearner
 from edgefilter.profile.data import Profile
-from edgefilter.types import SoundFor
 
 STREAMS_PER_CORE = 4
 """Clients at a time unless --streams says otherwise: a third of what a core bears by computing time, 0.08 s a second of
@@ -37,12 +37,12 @@ def main(args: argparse.Namespace) -> None:
     cores = len(allowed_cores())
     streams = args.streams or STREAMS_PER_CORE * cores
 
-    def make_filter(learns: bool, output: SoundFor = "recognise") -> EgoFilter:
+    def make_filter(learns: bool, form: Form) -> EgoFilter:
         learner = BackgroundLearner(profile) if learns else None
-        settings = BargeInSettings(judge="network", confirm_s=args.confirm_s)
-        return EgoFilter(profile, engine=args.engine, barge_in=settings, learn=learner, output=output)
+        settings = BargeInSettings(judge="network", confirm_s=args.confirm_s, ask_db=form.ask_db)
+        return EgoFilter(profile, engine=args.engine, barge_in=settings, learn=learner, output=form.output)
 
-    make_filter(False)  # what cannot be made is said now, and what is slow to load is loaded
+    make_filter(False, Form())  # what cannot be made is said now, and what is slow to load is loaded
 
     def ready(port: int) -> None:
         whose = "any machine with the token" if token else "this machine"

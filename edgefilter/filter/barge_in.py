@@ -42,8 +42,10 @@ class BargeInSettings:
     release: probability below which a hop counts as silent; lower than the threshold, so that soft syllables do not end a
     sentence. min_silence_s: how long the silence lasts before speech has ended; 0.5 s bridges the pauses within a
     sentence, 0.2 s tells a recogniser sooner. judge: "engine", or "network" to let crnn's network judge beside an engine
-    that judges no speech (`ss`, `linear`), at what crnn costs.
-    Raises UsageError for probabilities outside 0 to 1, a release above the threshold, negative times, or another judge.
+    that judges no speech (`ss`, `linear`), at what crnn costs. ask_db: by how much the robot lowers its voice, dB, while
+    somebody is suspected to speak; 0, never. What is heard with the lower voice then decides. It needs a player that
+    follows `EgoFilter.playback_gain`; 12 dB is what one person does when another begins to talk.
+    Raises UsageError for probabilities outside 0 to 1, a release above the threshold, negative times or decibels, or another judge.
     """
 
     threshold: float = 0.97
@@ -51,6 +53,7 @@ class BargeInSettings:
     confirm_s: float = 0.3
     min_silence_s: float = 0.5
     judge: Judge = "engine"
+    ask_db: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0.0 < self.release <= self.threshold < 1.0:
@@ -59,6 +62,8 @@ class BargeInSettings:
         if not (0.0 <= self.confirm_s < math.inf and 0.0 <= self.min_silence_s < math.inf):
             found = f"confirm_s {self.confirm_s} and min_silence_s {self.min_silence_s}"
             raise UsageError(f"barge-in got {found}, expected seconds, 0 or more")
+        if not 0.0 <= self.ask_db < math.inf:
+            raise UsageError(f"barge-in got ask_db {self.ask_db}, expected decibels, 0 or more")
         if self.judge not in get_args(Judge):
             raise UsageError(f"barge-in got judge '{self.judge}', expected one of {', '.join(get_args(Judge))}")
 
@@ -68,7 +73,10 @@ class BargeIn:
 
     Speech is suspected in the first hop that reaches the threshold. The log-odds of the hops that follow, less those of
     the threshold, are added up (Wald 1945, "Sequential tests of statistical hypotheses"): at the bounds of an ERROR, or
-    by their sign when the time to confirm is over, speech has begun, or the suspicion is dismissed.
+    by their sign when the time to confirm is over, speech has begun, or the suspicion is dismissed. Where the robot lowers
+    its voice meanwhile, those bounds only tell whether anybody speaks, and a human is who is still heard with the lower
+    voice: from then on the sum begins anew and never falls below 0 (Page 1954, "Continuous inspection schemes"), and who
+    has not reached the upper bound within the time to confirm was the robot.
     hop_s: seconds between two probabilities. settings: None for the defaults.
 
     >>> talk = BargeIn(0.016)
@@ -85,13 +93,18 @@ class BargeIn:
         self._forget()
 
     def _forget(self) -> None:
-        self._hops, self._evidence, self._certain = 0, 0.0, False
+        self._hops, self._asked, self._evidence, self._certain = 0, 0, 0.0, False
         self._told: EventKind | None = None
 
     @property
     def speaking(self) -> bool:
         """Whether speech has begun and not ended."""
         return self._told == "speech_started"
+
+    @property
+    def asking(self) -> bool:
+        """Whether the robot should speak more softly now, so that what is heard tells whether it was the robot."""
+        return self._asked > 0 and not self._certain
 
     @property
     def waited(self) -> int:
@@ -106,15 +119,18 @@ class BargeIn:
             return "speech_stopped"
         return "speech_dismissed" if told else None
 
-    def note(self, probability: float | None, wait: int = 0) -> EventKind | None:
+    def note(self, probability: float | None, wait: int = 0, heard_after: int = 0) -> EventKind | None:
         """Take the probability of a hop, None where the engine does not judge it.
 
         wait: hops for which speech that has begun is not told yet, nor suspected; if it has ended by then it never is.
+        heard_after: hops after which a voice that is lowered now would be heard lower; 0 where it cannot be lowered.
         """
         probability = probability or 0.0
         self._silent = self._silent + 1 if probability < self.settings.release else 0
         if not self._hops and probability < self.settings.threshold:
             return None
+        if not self._hops and heard_after <= self._longest:
+            self._asked = heard_after
         self._hops += 1
         if self._silent >= self._pause or not self._holds(probability):
             return self.end()
@@ -128,9 +144,20 @@ class BargeIn:
         """Whether what was suspected is not dismissed by another hop."""
         if self._certain:
             return True
+        if self._hops == self._asked + 1:
+            self._evidence = 0.0
         if self._hops > 1:  # the first was chosen for its odds
             self._evidence += log_odds(probability) - self._threshold
+        if (
+            self._hops > self._asked > 0
+        ):  # a human goes on speaking, be it after a pause; a robot that is softer does not
+            self._evidence = max(self._evidence, 0.0)
+            self._certain = self._evidence >= self._bound
+            return self._certain or self._hops < self._asked + self._longest
         decided = self._hops >= self._longest or abs(self._evidence) >= self._bound
+        if decided and self._asked and self._evidence >= 0.0:
+            self._evidence = math.inf  # somebody speaks; whether it is the robot, the lower voice will tell
+            return True
         self._certain = decided and self._evidence >= 0.0
         return self._certain or not decided
 

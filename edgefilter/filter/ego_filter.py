@@ -55,8 +55,8 @@ class EgoFilter:
         Keep the output of the linear stage for each microphone channel, for `robot_removed`.
     on_suspicion : callable, optional
         Called in the same way with "speech_suspected", some 50 ms before a human's speech counts as begun, and with
-        "speech_dismissed" where nobody spoke, 0.3 s later at most (`BargeInSettings.confirm_s`): a robot may lower its
-        voice meanwhile.
+        "speech_dismissed" where nobody spoke, 0.3 s later at most (`BargeInSettings.confirm_s`), or as long after a lower
+        voice is heard (`playback_gain`).
     output : str
         Which of two sounds `process` returns; `other` gives the other one. "recognise": for a recogniser. "listen": for a
         call, a level meter or a detector of speech; up to 14 dB lower where the engine hears nobody speak, and the same
@@ -181,6 +181,28 @@ class EgoFilter:
     def human_speaks(self) -> bool:
         """Whether the human is speaking, pauses of half a second included; False where the engine does not judge it."""
         return self._stream.barge_in.speaking
+
+    @property
+    def playback_gain(self) -> float:
+        """Gain with which the robot should speak now: below 1 while somebody is suspected to speak (`BargeInSettings.ask_db`), else 1.
+
+        Whoever plays fades to it within some 10 ms, and hands over as the reference what is played then. An event
+        "playback_gain" tells of each change.
+        """
+        return self._stream.playback_gain
+
+    @property
+    def queued_s(self) -> float:
+        """Seconds of speech that the loudspeaker has been handed and has not played yet; whoever knows it says so here, 0 at first.
+
+        Such speech cannot be lowered any more. Where a lower voice would be heard too late (`BargeInSettings.confirm_s`),
+        the robot is not asked to lower it.
+        """
+        return self._stream.queued / SAMPLE_RATE
+
+    @queued_s.setter
+    def queued_s(self, seconds: float) -> None:
+        self._stream.queued = round(seconds * SAMPLE_RATE)
 
     @property
     def judges_speech(self) -> bool:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
 
 import numpy as np
 
+from edgefilter.alignment.delay_line import Aligned
 from edgefilter.dsp import fourier
 from edgefilter.dsp.ring import Ring
 from edgefilter.dsp.stft import Synthesiser
@@ -47,6 +49,8 @@ NOBODY = 0.2
 lower with it than the microphone, and 26.1 in the other sound. Eight humans laid on them 6 to 13 dB below lose .3 dB, one of them
 1.9, and .1 dB of SI-SDR; in seven real double talks AECMOS takes .20 off the human, most where 1.6 is said of the echo. By what
 the network says itself in place of the calibrated probability it would be 31.4 dB, .1 dB and .19."""
+SOFTER_HOPS = 3
+"""Hops from a lower voice at the microphone until what the engine answers is of it alone: its fade, the window, the caller's block."""
 
 
 class Stream:
@@ -55,7 +59,8 @@ class Stream:
     `EgoFilter` says what process, flush, robot_removed and the properties give. With an engine that waits for the end,
     process returns nothing and flush everything. stepping: told the compute time of every hop; what it answers becomes an
     event. barge_in, learner, on_barge_in, keep_channels, on_suspicion, output: as of `EgoFilter`. other: (n,), the sound that
-    was not asked for, of the samples that process or flush returned last.
+    was not asked for, of the samples that process or flush returned last. queued: samples that the loudspeaker has been handed and
+    not played yet: they cannot be lowered any more.
     """
 
     def __init__(
@@ -107,6 +112,7 @@ class Stream:
         self.other = NOTHING[1]
         self._unexplained = np.ones(2)
         self._flushed = False
+        self.queued = 0
 
     def process(self, mic: Samples, ref: Samples) -> Samples:
         """Take mic (n,), of an array (n, channels), and ref (n,); return what is finished, 0 to n + latency samples."""
@@ -231,25 +237,38 @@ class Stream:
         self._unexplained = UNEXPLAINED_MEMORY * self._unexplained + np.array(output.unexplained)
         share = 1.0 if speaking else float(self._unexplained[0] / self._unexplained[1])  # who speaks may do so softly
         human = None if said is None else human_probability(said, share)
-        self._judge_speech(human, frame.at_any_lag)
+        self._judge_speech(human, frame, aligned)
         self.front.hear(frame, output, self.speech_probability, self.barge_in.speaking)
         listen = 1.0 if human is None or self.barge_in.speaking else NOBODY ** (1.0 - human)
         return self._synthesiser.push(output.spectrum, 1.0, listen)
 
-    def _judge_speech(self, probability: float | None, at_any_lag: bool) -> None:
+    @property
+    def playback_gain(self) -> float:
+        """As of `EgoFilter`."""
+        return 10.0 ** (-self.barge_in.settings.ask_db / 20.0) if self.barge_in.asking else 1.0
+
+    def _softer_after(self, frame: Frame, aligned: Aligned | None) -> int:
+        """Hops after which a voice that is lowered now would be heard, 0 where nobody lowers it or nothing of it is heard."""
+        if not self.barge_in.settings.ask_db or frame.idle or aligned is None or not math.isfinite(aligned.delay):
+            return 0
+        return SOFTER_HOPS + math.ceil((self.queued + max(aligned.delay, 0.0)) / self.engine.stft.hop)
+
+    def _judge_speech(self, probability: float | None, frame: Frame, aligned: Aligned | None) -> None:
         self.speech_probability = probability
-        wait = 0
+        wait, gain = 0, self.playback_gain
         if probability is not None:
-            suspect = at_any_lag or (self._watch is not None and self._watch.suspect)
+            suspect = frame.at_any_lag or (self._watch is not None and self._watch.suspect)
             wait = self._watch.wait // self.engine.stft.hop if self._watch else 0
             self.speech_probability = 0.0 if suspect else probability
-        if talk := self.barge_in.note(self.speech_probability, wait):
+        if talk := self.barge_in.note(self.speech_probability, wait, self._softer_after(frame, aligned)):
             self._tell_of_speech(talk, f"probability {self.speech_probability or 0.0:.2f}")
             if call := self._called.get(talk):
                 try:
                     call(self.events[-1])
                 except BaseException as error:  # the rest of the block is filtered first
                     self._raised = self._raised or error
+        if self.playback_gain != gain:
+            self._tell("playback_gain", f"{self.playback_gain:.3f}")
 
     def _tell(self, kind: EventKind, detail: str, turn: Turn | None = None, sound: Turn | None = None) -> None:
         self.events.append(Event(kind, self._stepped, detail, turn, sound))

@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from edgefilter.audio.channels import Channels
+from edgefilter.audio.fade import Fade
 from edgefilter.audio.pairing import Pairing
 from edgefilter.audio.raw import delivered, of_pcm16, to_pcm16
 from edgefilter.audio.sample_clock import Lateness, SampleClock
@@ -120,7 +121,7 @@ class Duplex:
         self._gaps = self._refused = self.heard = 0
         self._from_agent = Resampler(SAMPLE_RATE, SAMPLE_RATE)
         self._from_mic, self._to_agent = (Resampler(SAMPLE_RATE, SAMPLE_RATE) for _ in range(2))
-        self._pace = Pace(clock)
+        self._pace, self._asked = Pace(clock), Fade()
         self._losses, self._delivered_s, self._timed = SampleClock(), 0.0, False
         self._unheard, self._came = np.zeros(0, np.float32), np.zeros(0, bool)
         self._kept: deque[Event] = deque(maxlen=1000)
@@ -145,6 +146,20 @@ class Duplex:
     def play_pcm16(self, pcm: bytes | memoryview, rate: int, channels: int = 1) -> None:
         """As `play`, for 16-bit samples, interleaved."""
         self.play(from_pcm16(pcm, channels), rate)
+
+    def lowered(self, samples: Samples, rate: int) -> Samples:
+        """Return what to hand to the loudspeaker, and to `play`: the samples (n,) or (n, channels), softer where the filter asks for it.
+
+        The filter asks while somebody is suspected to speak (`BargeInSettings.ask_db`, `EgoFilter.playback_gain`). rate: Hz.
+        """
+        self._asked.wanted = self.ego.playback_gain
+        return self._asked.apply(samples, rate)
+
+    def lowered_pcm16(self, pcm: bytes | memoryview, rate: int, channels: int = 1) -> bytes | memoryview:
+        """As `lowered`, for 16-bit samples, interleaved."""
+        samples = of_pcm16(pcm, channels)
+        softer = self.lowered(samples, rate)
+        return pcm if softer is samples else to_pcm16(softer.ravel())[0].astype("<i2").tobytes()
 
     def end(self) -> None:
         """Take the utterance for complete: the microphone does not wait for more of it."""
@@ -189,6 +204,7 @@ class Duplex:
                 self._pairing.hear(self._from_mic.push(samples))
                 self._follow_losses(len(samples) / rate, at_s)
                 mic, reference = self._paired()
+                self.ego.queued_s = self.queued_s
             if self._both:
                 mic, reference = mic[:, :-1], mic[:, -1]
             human = self._filter(mic, reference)

@@ -17,6 +17,7 @@ from edgefilter.audio.channels import Channels
 from edgefilter.audio.raw import FULL_SCALE, to_pcm16
 from edgefilter.dsp.resample import Resampler
 from edgefilter.errors import SignalError, UsageError
+from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.integrations.duplex import as_pcm16
 from edgefilter.integrations.wire import RATES
@@ -36,7 +37,7 @@ class EchoCanceller:
         Of microphone and reference, 8000 to 48000 Hz.
     channels : int
         Of the microphone's sound, 1 to 8. Each is filtered by itself, which takes its own time.
-    profile, engine, output : optional
+    profile, engine, output, barge_in : optional
         As of `EgoFilter`.
     mic_channels : sequence of int, optional
         Numbers, from 0, of the channels that are microphones of one array; the answer then is one channel, which
@@ -75,6 +76,7 @@ class EchoCanceller:
         engine: str = "auto",
         mic_channels: Sequence[int] | None = None,
         output: SoundFor = "recognise",
+        barge_in: BargeInSettings | None = None,
     ) -> None:
         if sample_rate not in RATES:
             expected = f"{RATES[0]} to {RATES[-1]} Hz: convert the sound before"
@@ -84,7 +86,7 @@ class EchoCanceller:
         array = Channels.named(mic_channels, there=channels)
         self.sample_rate, self.channels = sample_rate, channels
         self._heard = [array] if array else [Channels([number]) for number in range(channels)]
-        self._filters = [EgoFilter(profile, engine=engine, output=output) for _ in self._heard]
+        self._filters = [EgoFilter(profile, engine=engine, output=output, barge_in=barge_in) for _ in self._heard]
         first = self._filters[0]
         if first.waits_for_end:
             why = "needs the whole recording before it answers: take another engine"
@@ -134,6 +136,11 @@ class EchoCanceller:
     def speaking(self) -> bool:
         """Whether the human is speaking, by the first microphone; always False where the engine does not judge it."""
         return self._filters[0].human_speaks
+
+    @property
+    def playback_gain(self) -> float:
+        """Gain with which the robot should speak now, as of `EgoFilter`, by the first microphone."""
+        return self._filters[0].playback_gain
 
     def events(self) -> list[Event]:
         """What happened at the first microphone since the last call, as of `EgoFilter`; its samples are those at 16 kHz."""

@@ -99,6 +99,10 @@ class _Tap(io.AudioOutput):
 
     async def capture_frame(self, frame: rtc.AudioFrame) -> None:
         """Hand on first: a room waits here until somebody listens."""
+        form = frame.sample_rate, frame.num_channels
+        frame = rtc.AudioFrame(
+            self._duplex.lowered_pcm16(frame.data.cast("B"), *form), *form, frame.samples_per_channel
+        )
         await super().capture_frame(frame)
         await self._next.capture_frame(frame)
         self._duplex.play_pcm16(frame.data.cast("B"), frame.sample_rate, frame.num_channels)

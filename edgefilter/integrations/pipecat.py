@@ -39,8 +39,8 @@ _LOGGER = logging.getLogger(__name__)
 class EgoFilters:
     """Removes the robot's voice from a Pipecat transport's microphone.
 
-    Two Pipecat filters share one EgoFilter: the one of the loudspeaker takes what is written to it as the reference and
-    changes nothing, the one of the microphone filters.
+    Two Pipecat filters share one EgoFilter: the one of the loudspeaker takes what is written to it as the reference, and
+    lowers it where the filter asks for that (`BargeInSettings.ask_db`), the one of the microphone filters.
 
     ego, mic_channels, reference_channel: as of `edgefilter.integrations.duplex.Duplex`, channels of the in_channels.
     in_channels, out_channels: of the transport's microphone and loudspeaker, of which Pipecat tells a filter nothing.
@@ -118,6 +118,7 @@ class _Loudspeaker(_Filter):
             _LOGGER.warning(
                 "the loudspeaker has two equal channels, not one as was said: give EgoFilters out_channels=2"
             )
+        audio = bytes(self._duplex.lowered_pcm16(audio, self._rate, self._channels))
         self._duplex.play_pcm16(audio, self._rate, self._channels)
         return audio
 

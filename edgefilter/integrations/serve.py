@@ -30,7 +30,7 @@ from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.integrations.doors import complain_briefly, in_one_line
 from edgefilter.integrations.duplex import Pace, as_pcm16, from_pcm16
 from edgefilter.integrations.wire import Decode, Form, Limits, TwoStreams, message_of
-from edgefilter.types import SAMPLE_RATE, SET_UP_WRONG, Event, Samples, SoundFor
+from edgefilter.types import SAMPLE_RATE, SET_UP_WRONG, Event, Samples
 
 _LOGGER = logging.getLogger(__name__)
 Answer = bytes | str
@@ -168,14 +168,14 @@ class Session:
 class Service:
     """Serves streams until it is told to stop.
 
-    make_filter: makes a stream's filter; told whether it learns, and its output. streams: clients at a time; more are sent
+    make_filter: makes a stream's filter; told whether it learns, and the first message. streams: clients at a time; more are sent
     away with a word. learners: streams that may learn at a time. token: what a client has to send as `Authorization: Bearer TOKEN`.
     Programs within web pages are sent away: a page that somebody opens must not listen to the robot.
     """
 
     def __init__(
         self,
-        make_filter: Callable[[bool, SoundFor], EgoFilter],
+        make_filter: Callable[[bool, Form], EgoFilter],
         streams: int,
         learners: int,
         token: str | None,
@@ -264,7 +264,7 @@ class Service:
             async with (
                 self._making
             ):  # one at a time: several would hold the interpreter's lock and delay the others' sound
-                ego = await asyncio.to_thread(self._make, learns, form.output)
+                ego = await asyncio.to_thread(self._make, learns, form)
             session = Session(form, ego, self._limits)
             await self._send(connection, deque([session.ready(learns)]))
             await self._converse(connection, session)

@@ -131,6 +131,8 @@ class EgoService:
         until = time.monotonic() + chunk.seconds
         while self.duplex.queued_s > AHEAD_S and time.monotonic() < until:
             await asyncio.sleep(0.005)
+        form = chunk.rate, chunk.width, chunk.channels
+        chunk = AudioChunk(*form, bytes(self.duplex.lowered_pcm16(chunk.audio, chunk.rate, chunk.channels)))
         self.duplex.play_pcm16(chunk.audio, chunk.rate, chunk.channels)
         try:
             await self.player.write(chunk)
@@ -498,6 +500,8 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--engine", default="auto", help="one beside which the network can judge speech")
     told = "longest time from the suspicion that the human speaks to certainty, s"
     parser.add_argument("--confirm-s", type=float, default=BargeInSettings.confirm_s, help=told)
+    told = "lower the voice by so much while the human may have begun to speak, to hear who it was, dB"
+    parser.add_argument("--ask-db", type=float, default=BargeInSettings.ask_db, help=told)
     parser.add_argument("--mic-uri", default=MIC_URI, help="where satellites find the microphone")
     parser.add_argument("--snd-uri", default=SND_URI, help="where satellites find the loudspeaker")
     parser.add_argument("--asr-uri", default=ASR_URI, help="where Home Assistant finds the recogniser")
@@ -514,9 +518,8 @@ def main(words: list[str] | None = None) -> int:
                     f"{option} {uri} lets other machines listen, and Wyoming knows no password: leave it out, or say --open"
                     " where every machine that reaches it may hear the microphone and speak"
                 )
-        ego = EgoFilter(
-            args.profile, engine=args.engine, barge_in=BargeInSettings(judge="network", confirm_s=args.confirm_s)
-        )
+        settings = BargeInSettings(judge="network", confirm_s=args.confirm_s, ask_db=args.ask_db)
+        ego = EgoFilter(args.profile, engine=args.engine, barge_in=settings)
         mic_format = AudioFormat(args.mic_command_rate, 2, args.mic_command_channels)
         snd_format = AudioFormat(args.snd_command_rate, 2, args.snd_command_channels)
         more = args.stop_for_speech, args.mic_channels, args.recogniser, args.reference_channel

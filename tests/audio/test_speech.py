@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from edgefilter.audio.device import find
+from edgefilter.audio.fade import FADE_S
 from edgefilter.audio.live import LiveSource
 from edgefilter.audio.pairing import TOLERANCE
-from edgefilter.audio.port import FADE_S, SpokenReference
+from edgefilter.audio.port import SpokenReference
 from edgefilter.audio.pulse import Device
 from edgefilter.commands.run import limited
 from tests.audio.virtual_portaudio import VirtualDevice

@@ -276,7 +276,7 @@ def test_interruptions_and_false_stops_from_end_to_end(
 ) -> None:
     asked = []
 
-    def listen(mic: np.ndarray, ref: np.ndarray, profile: object, engine: str) -> Output:
+    def listen(mic: np.ndarray, ref: np.ndarray, profile: object, engine: str, robot: object = None) -> Output:
         """A filter that notices the human after 0.1 s if the robot is as loud as ever, and passes the microphone."""
         asked.append(ref)
         onset = first_sound(scene.signals["clean"].astype(np.float32)) + RATE // 10
@@ -313,14 +313,49 @@ def test_interruptions_and_false_stops_from_end_to_end(
     assert not asked and again["tables"] == found["tables"]
 
 
+def test_a_robot_that_asks_is_heard_lower_as_late_as_its_sound_comes(monkeypatch: pytest.MonkeyPatch) -> None:
+    heard = []
+
+    class Asking:
+        """Asks from its tenth hop on, for ten hops."""
+
+        hop, speech_probability = 256, 0.0
+
+        def __init__(self, *of: object, **more: object) -> None:
+            self.hops = 0
+
+        @property
+        def playback_gain(self) -> float:
+            return 0.25 if 10 <= self.hops < 20 else 1.0
+
+        def process(self, mic: np.ndarray, ref: np.ndarray) -> np.ndarray:
+            self.hops += 1
+            heard.append((mic, ref))
+            return mic
+
+        def events(self) -> list[Event]:
+            return []
+
+        def flush(self) -> np.ndarray:
+            return np.zeros(0, np.float32)
+
+    monkeypatch.setattr(barge_in, "EgoFilter", Asking)
+    ones, late = np.ones(50 * 256, np.float32), 5 * 256
+    barge_in.listen(1.5 * ones, ones, None, "crnn", barge_in.Robot(ones, late, 12.0))
+    mic, ref = (np.concatenate(part) for part in zip(*heard))
+    lowered = np.flatnonzero(ref < 0.3)
+    assert 10 * 256 < lowered[0] < 11 * 256 and 20 * 256 <= lowered[-1] < 21 * 256
+    np.testing.assert_allclose(mic[late:], 0.5 + ref[:-late], atol=1e-6)
+
+
 def test_no_stop_in_half_an_hour_says_at_most_seven_an_hour() -> None:
     assert [barge_in.synthesiser(voice) for voice in ("espeak-en-gb+m3", "af_bella", "real-recorded")] == [
         "espeak",
         "neural",
         "real",
     ]
-    row = {"speech_s": 1800.0, "stops": 0, "said": [["a", 900.0], ["a", 900.0]], "voice": "v"}
-    robots, minutes, distinct, voices, count, rate = barge_in.false_stops([row])
-    assert (robots, minutes, distinct, voices, count) == (1, 30.0, 15.0, 1, 0)
+    row = {"speech_s": 1800.0, "stops": 0, "asked": 2, "said": [["a", 900.0], ["a", 900.0]], "voice": "v"}
+    robots, minutes, distinct, voices, count, rate, asked = barge_in.false_stops([row])
+    assert (robots, minutes, distinct, voices, count, asked) == (1, 30.0, 15.0, 1, 0, 2)
     assert rate["mean"] == rate["low"] == 0.0
     assert rate["high"] == pytest.approx(3.689 / 0.5, abs=0.01)  # the exact bound of a count of 0, Garwood 1936

@@ -4,6 +4,7 @@ import os
 import subprocess
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,12 +13,13 @@ import soundfile
 from edgefilter import EgoFilter
 from edgefilter.cli import main
 from edgefilter.commands import observers
-from edgefilter.commands.observers import Availability, EventCommand, lower
+from edgefilter.commands.observers import Availability, EventCommand, Lowering
 from edgefilter.filter.barge_in import INTERRUPTIONS, SUSPICIONS
 from edgefilter.session import Progress
 from edgefilter.types import Event
 from tests.program import argv
 
+GAIN = Event("playback_gain", 24000, "0.250")
 STARTED, STOPPED = (Event(f"speech_{word}", 24000, "probability 0.98") for word in ("started", "stopped"))
 
 
@@ -69,18 +71,19 @@ def test_a_command_that_does_not_end_is_killed_with_its_children_and_not_multipl
     assert not alive.exists()
 
 
-@pytest.mark.parametrize(("how", "gains"), [("stop", [0.0, 0.0]), ("duck", [10**-0.5, 10**-0.5, 1.0])])
-def test_the_robot_is_stopped_for_good_or_lowered_while_the_human_speaks(how, gains):
-    class Speech:
-        def __init__(self):
-            self.gains = []
-
-        def fade(self, gain):
-            self.gains.append(gain)
-
-    speech = Speech()
-    for event in (STARTED, Event("learned", 0, ""), STARTED, STOPPED):
-        lower(speech, how, event)
+@pytest.mark.parametrize(
+    ("how", "gains"),
+    [("stop", [0.25, 0.0, 0.0, 0.0]), ("duck", [0.25, 10**-0.5, 10**-0.5, 1.0]), (None, [0.25, 1.0, 1.0, 1.0])],
+)
+def test_the_robot_is_lowered_while_the_filter_asks_for_it_and_stopped_for_good_or_lowered_while_the_human_speaks(
+    how, gains
+):
+    speech, ego = SimpleNamespace(gains=[]), SimpleNamespace()
+    speech.fade = speech.gains.append
+    lowering = Lowering(speech, ego, how)
+    for event, gain in ((GAIN, 0.25), (STARTED, 1.0), (GAIN, 1.0), (STOPPED, 1.0)):
+        ego.playback_gain = gain
+        lowering.hear(event)
     assert speech.gains == pytest.approx(gains)
 
 

@@ -8,10 +8,12 @@ import soundfile
 
 from edgefilter import EgoFilter
 from edgefilter.commands.display import say_event
+from edgefilter.engines.linear import Linear
 from edgefilter.errors import UsageError
 from edgefilter.filter.barge_in import ERROR, BargeIn, BargeInSettings, human_probability, log_odds
 from edgefilter.filter.budget import DEMO
-from edgefilter.types import SAMPLE_RATE, Event
+from edgefilter.filter.stream import Stream
+from edgefilter.types import SAMPLE_RATE, Event, Output
 
 HOP_S = 0.016
 UNSURE = 0.3
@@ -64,6 +66,31 @@ def test_of_independent_hops_with_true_odds_no_more_are_decided_wrongly_than_is_
     assert np.median([hop for hop, _ in decided]) < 10
 
 
+def test_where_the_robot_lowers_its_voice_what_is_heard_of_the_lower_one_decides():
+    sure, after, longest = [0.999] * 5, 5, round(BargeInSettings.confirm_s / HOP_S)
+
+    def asked(*probabilities):
+        talk = BargeIn(HOP_S)
+        return [(talk.note(probability, heard_after=after), talk.asking) for probability in probabilities]
+
+    for then, what, at in (
+        ([0.999] * 3, "speech_started", after),
+        ([*[0.5] * 10, 0.999, 0.999], "speech_started", after + 10),  # after a pause
+        ([0.5] * 30, "speech_dismissed", after + longest - 1),
+        ([*[0.98, 0.5] * 15], "speech_dismissed", after + longest - 1),
+    ):
+        found = asked(*sure, *then)  # what came before the lower voice was heard does not count
+        assert [(i, told) for i, (told, _) in enumerate(found) if told][:2] == [(0, "speech_suspected"), (at, what)]
+        assert all(asking for _, asking in found[:at]) and not found[at][1]
+    found = asked(0.98, 1e-4)
+    assert found[1] == ("speech_dismissed", False)  # what is clearly nobody needs no lower voice
+    talk = BargeIn(HOP_S)
+    for probability in sure:
+        talk.note(probability, heard_after=round(BargeInSettings.confirm_s / HOP_S) + 1)
+        assert not talk.asking  # a lower voice would come too late
+    assert talk.speaking
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -74,6 +101,7 @@ def test_of_independent_hops_with_true_odds_no_more_are_decided_wrongly_than_is_
         ({"release": 0.0}, "release 0.0"),
         ({"threshold": float("nan")}, "threshold nan"),
         ({"min_silence_s": -1.0}, "min_silence_s -1.0, expected seconds"),
+        ({"ask_db": -1.0}, "ask_db -1.0, expected decibels, 0 or more"),
         ({"judge": "me"}, "judge 'me', expected one of engine, network"),
     ],
 )
@@ -178,6 +206,36 @@ def test_who_gives_callbacks_is_called_at_the_suspicion_and_at_the_beginning_and
         found[confirm_s] = begun[0].sample, suspected
     assert not found[0.0][1] and found[0.3][1][0].sample == found[0.0][0]
     assert 0 < found[0.3][0] - found[0.0][0] < 0.3 * SAMPLE_RATE
+
+
+class Loud(Linear):
+    """Takes a microphone above -30 dBFS for a human, so that the robot is one unless it lowers its voice."""
+
+    def step(self, frame, state):
+        rms = np.sqrt(np.mean(np.abs(frame.mic) ** 2) / self.stft.window_length)
+        return Output(frame.mic, 0.9999 if rms > 10 ** (-30 / 20) else 0.0001), state
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("human", "right"), [(False, "speech_dismissed"), (True, "speech_started")])
+def test_a_robot_that_asks_tells_its_own_voice_from_a_human_by_lowering_it(human, right):
+    """A closed loop: a player that follows the gain, 100 ms before the microphone hears it."""
+    ref = (0.02 * np.random.default_rng(0).standard_normal(4 * SAMPLE_RATE)).astype(np.float32)
+    ref[2 * SAMPLE_RATE :] *= 10.0  # from here on loud enough to be taken for a human
+    lag, hop = 1600, 256
+    mic = 0.5 * np.concatenate((np.zeros(lag, np.float32), ref))[: ref.size]
+    stream = Stream(Loud(), barge_in=BargeInSettings(ask_db=12.0))
+    gains = np.ones(ref.size + hop, np.float32)
+    for at in range(0, ref.size - hop, hop):
+        gains[at : at + hop] = stream.playback_gain
+        heard = mic[at : at + hop] * gains[np.maximum(np.arange(at, at + hop) - lag, 0)]
+        stream.process(mic[at : at + hop] if human else heard, ref[at : at + hop] * gains[at : at + hop])
+    kinds = [event.kind for event in stream.events if event.kind.startswith(("speech", "playback"))]
+    first = kinds.index("speech_suspected")
+    assert kinds[first : first + 2] == ["speech_suspected", "playback_gain"]
+    assert right in kinds and (human or "speech_started" not in kinds)
+    lowered = [event.detail for event in stream.events if event.kind == "playback_gain"]
+    assert lowered[:2] == ["0.251", "1.000"]
 
 
 @pytest.mark.slow

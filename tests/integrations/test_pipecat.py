@@ -61,6 +61,21 @@ def test_the_loudspeaker_s_sound_is_left_alone_and_noted_at_its_rate(filters):
     assert filters.duplex.queued_s == pytest.approx(3200 / 24_000, abs=1e-3)
 
 
+def test_the_loudspeaker_s_sound_is_lowered_where_the_filter_asks_for_it_and_so_is_the_reference(filters, monkeypatch):
+    monkeypatch.setattr(EgoFilter, "playback_gain", 0.25)
+
+    async def speak():
+        await filters.params["audio_out_filter"].start(16_000)
+        return await filters.params["audio_out_filter"].filter(as_pcm16(NOISE))
+
+    sent = from_pcm16(asyncio.run(speak()))
+    faded = round(0.01 * 16_000)
+    np.testing.assert_allclose(sent[faded:], 0.25 * NOISE[faded:], atol=1e-4)
+    filters.duplex.end()
+    filters.duplex.hear(np.zeros(sent.size, np.float32), 16_000)
+    assert filters.duplex.stats()["played_s"] == pytest.approx(sent.size / 16_000)
+
+
 def test_a_stereo_loudspeaker_that_nobody_told_of_is_noticed(caplog):
     """Taken for one channel the reference would last twice as long as the speech: -2 dB instead of -27, without a word."""
     ears = EgoFilters(EgoFilter(engine="linear"))

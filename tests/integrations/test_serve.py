@@ -27,6 +27,7 @@ from edgefilter import EgoFilter, SignalError, enhance
 from edgefilter.cli import main
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.errors import UsageError
+from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.integrations.opus import Decoder, Encoder
 from edgefilter.integrations.serve import Service
 from edgefilter.integrations.wire import HEADER, Form, Limits, TwoStreams
@@ -57,7 +58,11 @@ def as_float(data):
 @asynccontextmanager
 async def serving(engine="crnn", profile=DEMO / "profile.npz", streams=4, token=None, **limits):
     """The address of a service, which is ended afterwards."""
-    make = lambda learns, output: EgoFilter(profile, engine=engine, output=output)  # noqa: E731
+
+    def make(learns, form):
+        settings = BargeInSettings(ask_db=form.ask_db)
+        return EgoFilter(profile, engine=engine, output=form.output, barge_in=settings)
+
     service = Service(make, streams, 0, token, Limits(**limits))
     async with served(service) as address:
         yield address
@@ -150,6 +155,15 @@ def test_a_client_gets_the_sound_that_it_asks_for(conversation):
     sound, _ = run(heard({"output": "listen"}, stereo_messages(mic, ref)))
     expected = enhance(as_float(pcm(mic)), as_float(pcm(ref)), DEMO / "profile.npz", engine="crnn", output="listen")
     np.testing.assert_allclose(as_float(b"".join(sound)), expected, atol=1 / 32768)
+
+
+def test_a_client_whose_player_lowers_its_voice_is_told_the_gain(conversation):
+    mic, ref = (x[: 13 * RATE].copy() for x in conversation[:2])
+    ref[7 * RATE :] = np.roll(ref[7 * RATE :], 3200)  # its lag of 350 ms is too long to hear the lower voice in time
+    for ask_db, gains in ((0, []), (12, ["0.251", "1.000"])):
+        _, told = run(heard({"ask_db": ask_db}, stereo_messages(mic, ref)))
+        assert [each["detail"] for each in told if each["kind"] == "playback_gain"][:2] == gains
+        assert "speech_started" in kinds(told)
 
 
 @pytest.mark.parametrize("rate", [8000, 44100, 48000])
@@ -288,6 +302,7 @@ def test_a_first_message_needs_to_say_nothing():
         ('{"codec": "mp3"}', "codec 'mp3', expected pcm or opus"),
         ('{"volume": 3}', "'volume', expected rate, streams"),
         ('{"codec": "opus"}', "codec opus needs two streams"),
+        ('{"ask_db": 41}', "ask_db 41, expected 0 to 40"),
         ('{"output": "hear"}', "output 'hear', expected recognise or listen"),
         ('{"late_ms": 5000}', "late_ms 5000, expected 0 to 2000"),
     ],
@@ -562,7 +577,7 @@ def test_a_client_whose_messages_would_fill_the_memory_is_told_and_what_it_sent_
             kept.append(weakref.ref(self))
 
     async def talk():
-        service = Service(lambda learns, output: Kept(engine="linear"), 1, 0, None)
+        service = Service(lambda learns, form: Kept(engine="linear"), 1, 0, None)
         async with served(service) as address:
             gc.disable()
             try:
@@ -598,7 +613,7 @@ def test_beside_clients_that_send_4_MB_at_once_a_stream_in_real_time_is_filtered
     """Between a message and its answer, of 62 s that others have sent some parts of 20 ms are filtered."""
     filters = []
 
-    def make(learns, output):
+    def make(learns, form):
         filters.append(Counting(engine="linear"))
         return filters[-1]
 
@@ -634,7 +649,7 @@ def test_a_client_that_is_behind_catches_up_before_others_go_on():
     """A network that stood still for two seconds hands over all at once: that is due, and no backlog."""
     filters = []
 
-    def make(learns, output):
+    def make(learns, form):
         filters.append(Counting(engine="linear"))
         return filters[-1]
 
