@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict, dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
@@ -19,26 +21,46 @@ from edgefilter.echo.measurement import whiten
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.recording import BLOCK, fitted_blocks, paired
 from edgefilter.echo.wiener import convolve_from, fit_filter
-from edgefilter.errors import SignalError
+from edgefilter.errors import SignalError, UsageError
 from edgefilter.profile.approximation import CLEARLY_DB
 from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, GRID_HZ, PROVISIONAL, Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
-TAPS = 4096
-OTHERS_DB = 6.0
-"""How far above the robot something is that is not the robot's."""
-UPSAMPLED = 4
-MAX_PPM, PPM_STEP = 400.0, 2.0
-DRIFT_GAIN = 1.1
-"""By this factor the correlation along a sloping line must exceed that along a level one."""
-REACH = 512
-"""Samples ahead of the highest correlation in which the direct sound is looked for."""
-DECAYS_S = (0.15, 0.4)
-"""Reverberation times that the penalty on the taps supposes; the one that predicts best is kept."""
 TAIL_S = 0.3
-LEAST_FRAMES = 8
-MOMENT = SAMPLE_RATE // 20
-"""Samples over which the disturbance is measured that the fit gives way to."""
+
+
+@dataclass(frozen=True)
+class PathFit:
+    """How a path, a drift and the fan are read off a recording. Raises UsageError for what is not above 0."""
+
+    taps: int = 4096
+    """Of the path, 256 ms: as long as the first 40 dB of a decay of `decays_s`."""
+    reach: int = 512
+    """Samples ahead of the highest correlation in which the direct sound is looked for."""
+    decays_s: tuple[float, ...] = (0.15, 0.4)
+    """Reverberation times that the penalty on the taps supposes; the one that predicts best is kept."""
+    moment: int = SAMPLE_RATE // 20
+    """Samples over which the disturbance is measured that the fit gives way to."""
+    others_db: float = 6.0
+    """How far above the robot something is that is not the robot's."""
+    most_ppm: float = 400.0
+    """Largest drift that is looked for."""
+    step_ppm: float = 2.0
+    """Between two drifts that are tried: it moves a lag by one sample in half a minute."""
+    drift_gain: float = 1.1
+    """By this factor the correlation along a sloping line must exceed that along a level one."""
+    upsampled: int = 4
+    """Places of a correlation for each sample, so that a line crosses it in steps of a quarter."""
+    least_frames: int = 8
+    """Of silence: with fewer the quietest frames stand in for it."""
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            if not np.min(value) > 0:
+                raise UsageError(f"{name} is {value}, expected more than 0")
+
+
+FIT = PathFit()
 
 
 def self_calibrate(recording: Samples, reference: Samples, *, sample_rate: int = SAMPLE_RATE) -> Profile:
@@ -86,9 +108,9 @@ def self_calibrate(recording: Samples, reference: Samples, *, sample_rate: int =
     psd, seconds = fan_in_silences(y, silences(delayed(x, lag)))
     target = whiten(y, psd)
     fit = fitted_blocks(y.size).astype(np.float32)
-    sound = whiten(_drifting(delayed(x, lag - REACH), ppm), psd)
-    rough = fit_filter(sound, target, fit * disturbance(target), 2 * REACH, 0, np.full(2 * REACH, 1e-2))
-    delay = lag - REACH + int(np.argmax(np.abs(rough)))
+    sound = whiten(_drifting(delayed(x, lag - FIT.reach), ppm), psd)
+    rough = fit_filter(sound, target, fit * disturbance(target), 2 * FIT.reach, 0, np.full(2 * FIT.reach, 1e-2))
+    delay = lag - FIT.reach + int(np.argmax(np.abs(rough)))
     weights = fit * disturbance(target - convolve_from(sound, rough, 0))
     sound = whiten(_drifting(delayed(x, delay - PRE_ROLL), ppm), psd)
     path = fit_path(sound, target, weights, float(np.square(rough).max()))
@@ -121,31 +143,31 @@ def _drifting(x: Samples, ppm: float) -> Samples:
 def find_drift(recording: Samples, reference: Samples) -> tuple[float, int]:
     """The line along which recording (n,) lags behind reference (n,): its slope in ppm, and where it starts, in samples.
 
-    Of all lines of up to MAX_PPM the one on which the correlations of windows of a second, spectra flattened, add up to
-    most; 0 ppm where it brings less than DRIFT_GAIN of what no drift does. Lags of up to DRIFT_REACH.
+    Of all lines of up to FIT.most_ppm the one on which the correlations of windows of a second, spectra flattened, add up to
+    most; 0 ppm where it brings less than FIT.drift_gain of what no drift does. Lags of up to DRIFT_REACH.
     """
     size, part = 4 * SAMPLE_RATE, slice(2 * SAMPLE_RATE, 3 * SAMPLE_RATE)
     padded = np.pad(reference, (2 * SAMPLE_RATE, 2 * SAMPLE_RATE))
     starts = np.arange(0, recording.size - SAMPLE_RATE + 1, SAMPLE_RATE // 2)
-    reach = DRIFT_REACH * UPSAMPLED
+    reach = DRIFT_REACH * FIT.upsampled
     rows = np.zeros((starts.size, 2 * reach + 1))
     for row, start in zip(rows, starts, strict=True):
         heard = np.zeros(size)
         heard[part] = recording[start : start + SAMPLE_RATE]
         cross = flat_cross(padded[start : start + size], heard, size)
-        row[:] = correlation_near(cross, UPSAMPLED * size, reach)
-    grid = np.arange(-MAX_PPM, MAX_PPM + PPM_STEP, PPM_STEP)
+        row[:] = correlation_near(cross, FIT.upsampled * size, reach)
+    grid = np.arange(-FIT.most_ppm, FIT.most_ppm + FIT.step_ppm, FIT.step_ppm)
     middles = starts + SAMPLE_RATE / 2
     sums = np.empty((grid.size, rows.shape[1]))
     for line, ppm in zip(sums, grid, strict=True):
-        moves = np.round(-ppm * 1e-6 * middles * UPSAMPLED).astype(int)
+        moves = np.round(-ppm * 1e-6 * middles * FIT.upsampled).astype(int)
         at = (np.arange(rows.shape[1]) + moves[:, None]) % rows.shape[1]
         line[:] = np.abs(np.take_along_axis(rows, at, axis=1).sum(axis=0))
     heights = sums.max(axis=1)
     best = int(np.argmax(heights))
-    if heights[best] < DRIFT_GAIN * heights[grid.size // 2]:
+    if heights[best] < FIT.drift_gain * heights[grid.size // 2]:
         best = grid.size // 2
-    return float(grid[best]), round((int(np.argmax(sums[best])) - reach) / UPSAMPLED)
+    return float(grid[best]), round((int(np.argmax(sums[best])) - reach) / FIT.upsampled)
 
 
 def silences(reference: Samples) -> NDArray[np.bool_]:
@@ -160,45 +182,45 @@ def silences(reference: Samples) -> NDArray[np.bool_]:
 def fan_in_silences(recording: Samples, silent: NDArray[np.bool_]) -> tuple[Samples, float]:
     """PSD of the quieter half of the silent frames, (601,) float32, and how many seconds those are.
 
-    Where silent (n,) leaves fewer than LEAST_FRAMES, that of the quietest twentieth of all frames, and 0 seconds.
+    Where silent (n,) leaves fewer than FIT.least_frames, that of the quietest twentieth of all frames, and 0 seconds.
     """
     step = GRID_FFT // 2
     power = periodograms(recording, GRID_FFT)
     whole = frames(silent, GRID_FFT, step).all(axis=1)
-    share = 0.5 if whole.sum() >= LEAST_FRAMES else 0.05
+    share = 0.5 if whole.sum() >= FIT.least_frames else 0.05
     at = np.flatnonzero(whole) if share == 0.5 else np.arange(power.shape[0])
     order = at[np.argsort([np.log(np.maximum(power[frame], ROUNDING_PSD)).mean() for frame in at])]
-    kept = power[order[: max(int(share * order.size), LEAST_FRAMES // 2)]]
+    kept = power[order[: max(int(share * order.size), FIT.least_frames // 2)]]
     psd = uniform_filter1d(kept.mean(axis=0), 5, mode="nearest")
     return psd.astype(np.float32), kept.shape[0] * step / SAMPLE_RATE if share == 0.5 else 0.0
 
 
 def disturbance(residual: Samples) -> Samples:
     """Weights, 0 to 1, by which a fit trusts each sample, (n,): one over the power of the whitened residual (n,) around it."""
-    return 1.0 / np.maximum(uniform_filter1d(residual**2, MOMENT, mode="nearest"), 1.0)
+    return 1.0 / np.maximum(uniform_filter1d(residual**2, FIT.moment, mode="nearest"), 1.0)
 
 
 def fit_path(sound: Samples, target: Samples, weights: Samples, peak: float) -> Samples:
-    """Path from sound to target (n,), both whitened, (TAPS,). weights: (n,); peak: the square of the direct sound's tap.
+    """Path from sound to target (n,), both whitened, (FIT.taps,). weights: (n,); peak: the square of the direct sound's tap.
 
-    The penalty supposes a decay; the one of DECAYS_S is kept whose fit to three quarters of the weighted samples
+    The penalty supposes a decay; the one of FIT.decays_s is kept whose fit to three quarters of the weighted samples
     predicts the rest best.
     """
     rest = np.arange(target.size) // (BLOCK // 4) % 4 == 3
 
     def left(prior: Array) -> float:
-        taps = fit_filter(sound, target, weights * ~rest, TAPS, 0, prior)
+        taps = fit_filter(sound, target, weights * ~rest, FIT.taps, 0, prior)
         return float(np.sum(weights * rest * (target - convolve_from(sound, taps, 0)) ** 2))
 
-    best = min((decay_prior(seconds, peak) for seconds in DECAYS_S), key=left)
-    taps = fit_filter(sound, target, weights, TAPS, 0, best, steps=12)
+    best = min((decay_prior(seconds, peak) for seconds in FIT.decays_s), key=left)
+    taps = fit_filter(sound, target, weights, FIT.taps, 0, best, steps=12)
     weights = np.where(weights > 0.0, disturbance(target - convolve_from(sound, taps, 0)), 0.0).astype(np.float32)
-    return fit_filter(sound, target, weights, TAPS, 0, best, steps=20)
+    return fit_filter(sound, target, weights, FIT.taps, 0, best, steps=20)
 
 
 def decay_prior(seconds: float, peak: float) -> Array:
-    """Expected squares, (TAPS,): the direct sound's; from 2 ms on 15 dB less, falling by 60 dB in that time; before it 25 dB less."""
-    at = np.arange(TAPS) - PRE_ROLL
+    """Expected squares, (FIT.taps,): the direct sound's; from 2 ms on 15 dB less, falling by 60 dB in that time; before it 25 dB less."""
+    at = np.arange(FIT.taps) - PRE_ROLL
     late = 10**-1.5 * 10 ** (-6 * np.maximum(at, 0) / (seconds * SAMPLE_RATE))
     return peak * np.where(at < -16, 10**-2.5, np.where(at < 32, 1.0, late))
 
@@ -226,12 +248,12 @@ def _check_learned(target: Samples, predicted: Samples, fit: Samples, delay: flo
 
 
 def others(target: Samples, predicted: Samples) -> list[tuple[float, float]]:
-    """Stretches (start_s, end_s) where what the whitened prediction (n,) leaves of target (n,) is OTHERS_DB above it and the fan.
+    """Stretches (start_s, end_s) where what the whitened prediction (n,) leaves of target (n,) is FIT.others_db above it and the fan.
 
     Moments of a second or less between them belong to them.
     """
     rest = block_power(target - predicted, BLOCK)
-    loud = rest > 10 ** (OTHERS_DB / 10) * np.maximum(block_power(predicted, BLOCK), 10.0)
+    loud = rest > 10 ** (FIT.others_db / 10) * np.maximum(block_power(predicted, BLOCK), 10.0)
     loud = binary_closing(np.pad(loud, 2), np.ones(3))[2:-2]
     edges = np.flatnonzero(np.diff(np.concatenate(([False], loud, [False]))))
     return [(begin * BLOCK / SAMPLE_RATE, end * BLOCK / SAMPLE_RATE) for begin, end in edges.reshape(-1, 2)]

@@ -2,20 +2,36 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from edgefilter.diagnosis.passport import Passport
+from edgefilter.errors import UsageError
 from edgefilter.report.text import sentence
 
 ERROR_DB = 2.3, 8.4
 """Of the predicted SI-SDR, median and worst of 34 humans on 7 real devices, three engines: bench/results/passport.md."""
-DRIFTS_PPM = 50.0
-"""Clocks further apart than this share no crystal: those of one sound card agree to 1 ppm, two cheap ones to 100."""
-UNSTABLE_MS = 2.0
-"""A lag that moves more than this within a recording is no room's: buffers run empty or are filled up."""
-QUIET_DB = -50.0
-"""A microphone whose peaks stay under this uses 7 of its 16 bits."""
-UNLEARNED_DB = 6.0
-"""Where a fixed filter can remove so much more than the running one did, calibrating or learning pays."""
 
+
+@dataclass(frozen=True)
+class SetUp:
+    """A set-up of which nothing is said; raises UsageError for a difference that is not above 0."""
+
+    drift_ppm: float = 50.0
+    """Clocks further apart than this share no crystal: those of one sound card agree to 1 ppm, two cheap ones to 100."""
+    lag_spread_ms: float = 2.0
+    """A lag that moves more than this within a recording is no room's: buffers run empty or are filled up."""
+    quiet_db: float = -50.0
+    """A microphone whose peaks stay under this uses 7 of its 16 bits."""
+    unlearned_db: float = 6.0
+    """Where a fixed filter can remove so much more than the running one did, calibrating or learning pays."""
+
+    def __post_init__(self) -> None:
+        for name in ("drift_ppm", "lag_spread_ms", "unlearned_db"):
+            if not getattr(self, name) > 0:
+                raise UsageError(f"{name} is {getattr(self, name)}, expected more than 0")
+
+
+SET_UP = SetUp()
 CAUSES = {
     "nothing": "nothing stands in the way of a linear filter",
     "noise": "the noise is what a linear filter leaves",
@@ -57,18 +73,18 @@ def advice(found: Passport) -> list[str]:
     told = [FIRST[found.cause]] if found.cause in FIRST else []
     if not found.pauses:
         told += ["let the robot pause for some seconds while it is recorded: the noise is not known, and may be less"]
-    if found.mic_peak_db < QUIET_DB:
+    if found.mic_peak_db < SET_UP.quiet_db:
         told.append(f"turn the microphone's gain up: its peaks reach only {found.mic_peak_db:.0f} dBFS")
     if found.lost_ms:
         told.append(
             f"use a loopback that loses nothing, or larger buffers: {found.lost_ms:.0f} ms are missing in the reference"
         )
-    elif found.lag_spread_ms > UNSTABLE_MS:
+    elif found.lag_spread_ms > SET_UP.lag_spread_ms:
         told.append("use larger buffers, or one program for playing and recording: the lag jumps")
-    if abs(found.drift_ppm) > DRIFTS_PPM:
+    if abs(found.drift_ppm) > SET_UP.drift_ppm:
         told.append("use one sound card for loudspeaker and microphone, if you can: the clocks drift apart")
     linear = found.engines.get("linear")
-    if linear and found.removable_db - linear.removed_db > UNLEARNED_DB:
+    if linear and found.removable_db - linear.removed_db > SET_UP.unlearned_db:
         told.append("calibrate, or let it learn (`run --learn`): more can be removed than the filter did in this time")
     return [sentence(one) for one in told or ["nothing needs to be changed"]]
 

@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 import soundfile
 
-from edgefilter.calibration.from_recording import find_drift, self_calibrate
+from edgefilter.calibration.from_recording import PathFit, find_drift, self_calibrate
 from edgefilter.cli import main
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.effect import Effect, Parameter
 from edgefilter.echo.effects.catalogue import EFFECTS, register
 from edgefilter.echo.model import EchoModel
-from edgefilter.errors import SignalError
+from edgefilter.errors import SignalError, UsageError
 from edgefilter.filter.ego_filter import enhance
+from edgefilter.report.passport import SetUp
 from tests.diagnosis.robot_scene import DELAY, FAN, path, record, voice
 
 RATE = 16000
@@ -127,3 +128,10 @@ def test_a_filter_adapts_from_the_path_made_here_as_fast_as_from_a_learned_one(s
     }
     assert alone.learned and not replace(alone, source="").learned
     assert left[alone.source] < 0.8 * left[""]
+
+
+def test_settings_are_above_zero():
+    with pytest.raises(UsageError, match="taps is 0, expected more than 0"):
+        PathFit(taps=0)
+    with pytest.raises(UsageError, match="drift_ppm is -1, expected more than 0"):
+        SetUp(drift_ppm=-1)
