@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 import math
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from edgefilter.echo.effect import vanishes
 from edgefilter.echo.effects.catalogue import EFFECTS, find
 from edgefilter.echo.measurement import Measurement, whiten
 from edgefilter.echo.model import EchoModel
-from edgefilter.errors import ProfileError
+from edgefilter.errors import ProfileError, UsageError
 from edgefilter.filter.canceller import COLD, Canceller
 from edgefilter.filter.echo_path import PAST, TAPS, EchoPath, Effects, FilteredHop, PathState, PathUpdate, starting_path
 from edgefilter.filter.volume import AUDIBLE, WITNESSES
@@ -28,19 +28,38 @@ from edgefilter.profile.array import ArrayCalibration
 from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, LEARNED, Profile
 from edgefilter.types import SAMPLE_RATE, EventKind, Samples
 
-FIRST_S, FACTOR = 2.0, 1.5
-"""Seconds of audible robot until the first fit, and the factor to the next one. The wait is at most MINUTE, or RECENT_S
-after another path was taken over: then there is something to learn."""
-FADE = 0.9995
-"""The robot is AUDIBLE where the reference's power is that near to its recent peak, which fades by this factor a hop."""
-TIMES = 3
-"""As little as RECENT_S teaches more where it is replayed several times."""
 BEFORE = "the path of before"
-BLOCKS = 8, 60
-"""Of WITNESSES hops each, whose errors are compared as one: after so many a candidate can win, and is given up."""
-GAIN_DB, CERTAIN = 0.15, 2.5
-"""Mean fall of the error by which a candidate wins, and how many of its standard errors that must be: a human adds the same error
-to both."""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """When the learner fits, and when a candidate path wins or is given up. Raises UsageError for what is not above 0."""
+
+    first_s: float = 2.0
+    """Seconds of audible robot until the first fit."""
+    factor: float = 1.5
+    """From one wait to the next, which is at most MINUTE, or RECENT_S after another path was taken over: then there is something
+    to learn."""
+    fade: float = 0.9995
+    """The robot is AUDIBLE where the reference's power is that near to its recent peak, which fades by this factor a hop."""
+    times: int = 3
+    """As little as RECENT_S teaches more where it is replayed several times."""
+    least: int = 8
+    """Blocks of WITNESSES hops each, whose errors are compared as one, after which a candidate can win."""
+    most: int = 60
+    """Blocks after which it is given up."""
+    gain_db: float = 0.15
+    """Mean fall of the error by which a candidate wins."""
+    certain: float = 2.5
+    """How many of its standard errors that must be: a human adds the same error to both."""
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            if not value > 0:
+                raise UsageError(f"{name} is {value}, expected more than 0")
+
+
+SCHEDULE = Schedule()
 
 
 @dataclass
@@ -74,7 +93,7 @@ class CandidatePath:
             self.gains_db.append(10.0 * math.log10(self._running / self._its))
             self._begin()
             if self.stays:
-                del self.gains_db[: -2 * BLOCKS[0]]
+                del self.gains_db[: -2 * SCHEDULE.least]
 
     def restart(self) -> None:
         """Another path is in use now: the comparisons so far say nothing any more."""
@@ -90,14 +109,14 @@ class CandidatePath:
     def won(self) -> bool:
         """Whether it is clearly the better one."""
         count = len(self.gains_db)
-        if count < BLOCKS[0] or self.gain_db < GAIN_DB:
+        if count < SCHEDULE.least or self.gain_db < SCHEDULE.gain_db:
             return False
-        return self.gain_db > CERTAIN * float(np.std(self.gains_db, ddof=1)) / math.sqrt(count)
+        return self.gain_db > SCHEDULE.certain * float(np.std(self.gains_db, ddof=1)) / math.sqrt(count)
 
     @property
     def over(self) -> bool:
         """Whether it had its time."""
-        return not self.stays and len(self.gains_db) >= BLOCKS[1]
+        return not self.stays and len(self.gains_db) >= SCHEDULE.most
 
 
 class PathLearner:
@@ -143,7 +162,7 @@ class PathLearner:
             self._compared.append(
                 CandidatePath(self._fresh((), None, products=False), "a path from nothing", stays=True)
             )
-        self._audible_s, self._next_s, self._peak, self._sustained = 0.0, FIRST_S, 0.0, Sustained()
+        self._audible_s, self._next_s, self._peak, self._sustained = 0.0, SCHEDULE.first_s, 0.0, Sustained()
         self._snapshot = None
         self._counts = dict.fromkeys(self._counts, 0)
 
@@ -161,7 +180,7 @@ class PathLearner:
             return self._adopt(max(won, key=lambda candidate: candidate.gain_db))
         self._compared = [candidate for candidate in self._compared if not candidate.over]
         if audible and self._audible_s >= self._next_s:
-            self._next_s = min(self._next_s * FACTOR, self._next_s + MINUTE)
+            self._next_s = min(self._next_s * SCHEDULE.factor, self._next_s + MINUTE)
             self._compared = [candidate for candidate in self._compared if candidate.stays] + self._candidates()
             with suppress(ProfileError):  # it is tried again, and told of, at the end; the sound goes on
                 self._keep()
@@ -178,7 +197,7 @@ class PathLearner:
 
     def _audible(self, hop: FilteredHop) -> bool:
         power = float(hop.reference.dot(hop.reference))
-        self._peak = max(self._sustained.step(power), FADE * self._peak)
+        self._peak = max(self._sustained.step(power), SCHEDULE.fade * self._peak)
         audible = hop.located and power > AUDIBLE * self._peak
         self._audible_s += audible * self._hop / SAMPLE_RATE
         return audible
@@ -204,11 +223,11 @@ class PathLearner:
         if any(find(name).learned for name, _ in fitted):
             candidates.append(CandidatePath(self._fresh(fitted, self._response), "loudspeaker and path"))
         for candidate in candidates:
-            for _ in range(TIMES if short else 1):
+            for _ in range(SCHEDULE.times if short else 1):
                 self._history.replay(candidate.path)
         if self._response is not None or not short:
             elsewhere, recent = self._fresh(fitted, None), self._history.recent()
-            for _ in range(TIMES):
+            for _ in range(SCHEDULE.times):
                 recent.replay(elsewhere)
             candidates.append(CandidatePath(elsewhere, "another path"))
         return candidates
@@ -217,7 +236,7 @@ class PathLearner:
         """The effects of the beginning, those that can be learned as they explain the newest seconds."""
         recent, effects = self._history.recent(), self._begin.effects
         use = recent.usable()
-        if use.sum() < FIRST_S * SAMPLE_RATE / 2:
+        if use.sum() < SCHEDULE.first_s * SAMPLE_RATE / 2:
             return effects
         noise_psd = floored(periodograms(recent.signal("innovation")[use], GRID_FFT).mean(axis=0)).astype(np.float32)
         measurement = Measurement(recent.signal("reference"), recent.signal("mic"), noise_psd, use)

@@ -11,8 +11,8 @@ import soundfile
 
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE
-from tests.commands.test_cli import edgefilter, one_line
 from tests.filter.test_arrays import calibration, talk
+from tests.program import edgefilter, one_line
 
 
 @pytest.fixture(scope="module")

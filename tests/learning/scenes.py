@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import signal
 
+from edgefilter import EgoFilter
 from edgefilter.dsp.fractional_delay import interpolate
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -82,3 +83,17 @@ class Scene:
         span = slice(int(start_s * SAMPLE_RATE), int(stop_s * SAMPLE_RATE))
         self.reference, self.mic, self.human = self.reference[span], self.mic[span], self.human[span]
         return self
+
+
+def run(scene, learner=None, block=4096, profile=None):
+    ego = EgoFilter(profile, engine="linear", learn=learner)
+    out = [
+        ego.process(scene.mic[at : at + block], scene.reference[at : at + block])
+        for at in range(0, scene.mic.size, block)
+    ]
+    kinds = [event.kind for event in ego.events()]
+    return np.concatenate([*out, ego.flush()]), kinds, ego
+
+
+def db(x):
+    return 10 * np.log10(np.mean(np.square(x, dtype=np.float64)) + 1e-12)

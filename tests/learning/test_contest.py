@@ -1,10 +1,12 @@
 """A candidate takes over only on clear evidence."""
 
 import numpy as np
+import pytest
 
-from edgefilter.learning.path_learner import BLOCKS, CandidatePath
+from edgefilter.errors import UsageError
+from edgefilter.learning.path_learner import SCHEDULE, CandidatePath, Schedule
 
-LEAST, MOST = BLOCKS
+LEAST, MOST = SCHEDULE.least, SCHEDULE.most
 
 
 def candidate(gains):
@@ -38,3 +40,8 @@ def test_a_standing_rival_is_scored_by_its_latest_blocks_and_never_given_up():
     assert standing.won
     standing.restart()
     assert not standing.won
+
+
+def test_a_schedule_that_would_never_end_is_refused():
+    with pytest.raises(UsageError, match="factor is 0, expected more than 0"):
+        Schedule(factor=0)

@@ -7,21 +7,7 @@ from edgefilter import EgoFilter, PathLearner, Profile, ProfileError, enhance
 from edgefilter.filter.echo_path import starting_path
 from edgefilter.learning.path_learner import CandidatePath
 from edgefilter.types import SAMPLE_RATE
-from tests.learning.scenes import Scene
-
-
-def run(scene, learner=None, block=4096, profile=None):
-    ego = EgoFilter(profile, engine="linear", learn=learner)
-    out = [
-        ego.process(scene.mic[at : at + block], scene.reference[at : at + block])
-        for at in range(0, scene.mic.size, block)
-    ]
-    kinds = [event.kind for event in ego.events()]
-    return np.concatenate([*out, ego.flush()]), kinds, ego
-
-
-def db(x):
-    return 10 * np.log10(np.mean(np.square(x, dtype=np.float64)) + 1e-12)
+from tests.learning.scenes import Scene, db, run
 
 
 def seconds(x):

@@ -9,8 +9,7 @@ from edgefilter import PathLearner, Profile
 from edgefilter.echo.model import EchoModel
 from edgefilter.filter.echo_path import FilteredHop, starting_path
 from edgefilter.types import SAMPLE_RATE
-from tests.learning.scenes import Scene, room
-from tests.learning.test_path_learner import db, run
+from tests.learning.scenes import Scene, db, room, run
 
 HOP = 256
 
