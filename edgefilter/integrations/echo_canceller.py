@@ -20,7 +20,7 @@ from edgefilter.errors import SignalError, UsageError
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.integrations.duplex import as_pcm16
-from edgefilter.integrations.wire import RATES
+from edgefilter.integrations.wire import DEVICE_RATES
 from edgefilter.profile.data import Profile
 from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, Event, Samples, SoundFor
 
@@ -78,8 +78,8 @@ class EchoCanceller:
         output: SoundFor = "recognise",
         barge_in: BargeInSettings | None = None,
     ) -> None:
-        if sample_rate not in RATES:
-            expected = f"{RATES[0]} to {RATES[-1]} Hz: convert the sound before"
+        if sample_rate not in DEVICE_RATES:
+            expected = f"{DEVICE_RATES[0]} to {DEVICE_RATES[-1]} Hz: convert the sound before"
             raise UsageError(f"sample_rate is {sample_rate}, expected {expected}")
         if not 1 <= channels <= MOST_MICROPHONES:
             raise UsageError(f"channels is {channels}, expected 1 to {MOST_MICROPHONES}: leave some microphones out")

@@ -16,7 +16,7 @@ from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, Samples, SoundFor
 HEADER = struct.Struct("<BxHQ")
 """Before the sound of a message of one of two streams: its label, 0 for the microphone and 1 for the reference, an unused
 byte, the number of the message in its stream (from 65535 on to 0), and the counter of its first sample; little-endian."""
-RATES = range(8000, 48001)
+DEVICE_RATES = range(8000, 48001)
 """Hz that a device, or a program that calls a canceller, may have: what telephones and sound cards do."""
 
 
@@ -100,7 +100,7 @@ class Form:
         """
         given = message_of(text)
         bounds: dict[str, Any] = {
-            "rate": RATES,
+            "rate": DEVICE_RATES,
             "streams": ("stereo", "two"),
             "microphones": range(1, MOST_MICROPHONES + 1),
             "codec": ("pcm", "opus"),
