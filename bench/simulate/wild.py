@@ -54,8 +54,13 @@ class Command:
     run: Callable[[Array], Array]
 
     def __call__(self, x: Array) -> Array:
-        """Put x (n,) through the program, and back in time by whole samples."""
-        return put_back(self.run(x), x)
+        """Put x (n,) through the program, and back in time by whole samples; ends where what comes out is not all numbers."""
+        y = self.run(x)
+        if wrong := int(np.count_nonzero(~np.isfinite(y))):
+            sys.exit(
+                f"{self.words}: {wrong} of {y.size} samples that came out are not finite, expected none; leave this program out"
+            )
+        return put_back(y, x)
 
 
 @dataclass(frozen=True)

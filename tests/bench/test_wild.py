@@ -53,6 +53,15 @@ def test_a_program_that_is_not_there_says_which_packages_are_needed(monkeypatch:
         wild.sox("gain", -3)(np.zeros(100))
 
 
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_a_program_that_gives_samples_that_are_no_numbers_is_refused(wrong: float) -> None:
+    broken = wild.Command("sox reverb 50", lambda x: np.where(np.arange(x.size) < 3, wrong, x))
+    with pytest.raises(
+        SystemExit, match=r"sox reverb 50: 3 of 100 samples that came out are not finite, expected none"
+    ):
+        broken(np.ones(100))
+
+
 @pytest.mark.parametrize(("name", "least", "most"), [("microphone moved", 0.01, 0.06), ("robot moved", 0.0, 1.2)])
 def test_who_moves_stays_in_the_room(name: str, least: float, most: float) -> None:
     place = Place(np.array([4.0, 3.0, 2.6]), 0.4, 1, np.array([1.0, 1.0, 1.0]), np.array([1.2, 1.0, 0.9]))
