@@ -124,7 +124,7 @@ def diagnosed(case: Path, truth: Mapping | None) -> Outcome:
     try:
         profile = calibrate(*(recorded[name] for name in SIGNALS[:3]))
         found = diagnose(profile, recorded["mic"], recorded["ref"])
-        each = {"named": "effect", "before_db": "excess_before_db", "after_db": "excess_after_db", "share": "share"}
+        each = {"named": "name", "before_db": "excess_before_db", "after_db": "excess_after_db", "share": "share"}
         said = {key: tuple(getattr(one, of) for one in found.ranking) for key, of in each.items()}
         said |= {"verdict": found.verdict, "evidence": found.evidence}
         said |= {"excess_db": found.comparison.excess_db, "remaining_db": found.remaining_db}

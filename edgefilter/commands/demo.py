@@ -142,7 +142,7 @@ def _mend(name: str, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
         names = tuple(finding.effect for finding in in_order(found.ranking))
         applied = fit(recording, names, force=False, found=found)
         applied.profile.save(folder / "better.npz")
-    named = [finding.effect for finding in found.ranking]
+    named = [finding.name for finding in found.ranking]
     added, *more = applied.lines()
     told = [headline(found.verdict, named), added, *(line for line in more if line.startswith("proof"))]
     run = f"edgefilter run --input {folder}/talk.wav --reference {folder}/talk_tts.wav --profile {folder}"

@@ -44,4 +44,4 @@ def _diagnosed(recording: Samples, reference: Samples, step: Callable[[str], Non
         found = Recording(recording, reference).diagnose(progress=step)
     except SignalError as error:
         return None, f"not possible: {error}"
-    return found, headline(found.verdict, [finding.effect for finding in found.ranking], calibrated=False)
+    return found, headline(found.verdict, [finding.name for finding in found.ranking], calibrated=False)

@@ -55,7 +55,7 @@ def findings_of(found: Found, progress: Callable[[str], None] | None) -> tuple[t
                 ),
                 values=step.values,
                 prediction=step.score.prediction,
-                like=found.like.get(step.name, ""),
+                like=found.like.get(step.name),
             )
         )
         before = after

@@ -10,7 +10,7 @@ import numpy as np
 from edgefilter.diagnosis.closer_look import Curve
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.ordinary import p_value
-from edgefilter.diagnosis.trials import Found, Trial, added
+from edgefilter.diagnosis.trials import Found, Reading, Trial, added
 from edgefilter.echo.effect import vanishes
 from edgefilter.echo.effects.catalogue import EFFECTS, find
 from edgefilter.echo.measurement import Values
@@ -105,7 +105,7 @@ def with_laws(
     """
     for _ in range(MOST):
         left = max(found.final.over_db - found.final.floor_db, 0.0)
-        if found.final.excess_db <= (criteria.little_db if found.steps else criteria.explained_db):
+        if found.final.excess_db <= criteria.explained_db:
             break
         names = {step.name for step in found.steps}
         if not (tried := list(_trials(found, progress, without))):
@@ -163,12 +163,15 @@ def _without_superfluous(found: Found, law: Trial, criteria: Criteria) -> Trial:
 
 
 def _with(found: Found, law: Trial) -> Found:
-    """The outcome with a law; like: the strongest name that the law replaces."""
+    """The outcome with a law, under the strongest name that it replaces."""
     family, values = find(law.name).family, dict(law.model.effects)
     replaced = [step for step in found.steps if step.name not in values and find(step.name).family == family]
-    like = {law.name: replaced[0].name} if replaced else {}
     outcome = found.with_only({name: values[name] for name in added(found.start, law.model)})
-    return replace(outcome, like={**found.like, **like})
+    if not replaced:
+        return outcome
+    known_db, first = sum(step.gain_db for step in replaced), replaced[0].name
+    reading = found.like.get(first, Reading(first, known_db / (known_db + law.gain_db)))
+    return replace(outcome, like={**found.like, law.name: reading})
 
 
 def _given(effect: str, key: str) -> bool:

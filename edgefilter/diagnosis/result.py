@@ -12,6 +12,7 @@ from edgefilter.diagnosis.closer_look import CloserLook
 from edgefilter.diagnosis.compare import Comparison, rounded
 from edgefilter.diagnosis.independence import Independence
 from edgefilter.diagnosis.laws import Law
+from edgefilter.diagnosis.trials import Reading
 from edgefilter.echo.effect import Family
 from edgefilter.echo.measurement import Values
 from edgefilter.echo.model import EchoModel
@@ -59,7 +60,7 @@ class Finding:
 
     p_value: of what it explains, by itself or beside the others (diagnosis/ordinary.py). share: part of the excess power
     that it takes away, 0 to 1. values: as fitted, for EchoModel.with_effect. prediction: (n,) of the model with this and
-    all earlier findings. like: where the effect is the free law of a family, the listed effect that it is most like.
+    all earlier findings. like: where the effect is the free law of a family, the listed effect that it is known by.
     """
 
     effect: str
@@ -72,7 +73,12 @@ class Finding:
     evidence: str
     values: Values = field(repr=False)
     prediction: Samples = field(repr=False)
-    like: str = ""
+    like: Reading | None = None
+
+    @property
+    def name(self) -> str:
+        """The listed effect that it is known by: its own name but for a free law."""
+        return self.like.name if self.like else self.effect
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +178,7 @@ class Diagnosis:
                 "share": round(finding.share, 4),
                 "parameters": {name: asdict(interval) for name, interval in finding.parameters.items()},
                 "evidence": finding.evidence,
-                **({"like": finding.like} if finding.like else {}),
+                **({"like": finding.like.name, "like_share": round(finding.like.share, 4)} if finding.like else {}),
             }
             for finding in self.ranking
         ]

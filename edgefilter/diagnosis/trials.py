@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -56,12 +56,19 @@ class Tried:
     spared: bool = False
 
 
+class Reading(NamedTuple):
+    """The listed effect that a free law is known by, and the share of the law's gain that its few numbers bring, 0 to 1."""
+
+    name: str
+    share: float
+
+
 @dataclass(frozen=True, eq=False)
 class Found:
     """The outcome of a search from a start model.
 
     steps: the accepted effects in their order. notes: what the reader must know of the search. tried: every effect that
-    was fitted. like: of a free law the name of its family that it replaces. laws: those that were fitted beside all steps.
+    was fitted. like: of a free law the name that it replaces. laws: those that were fitted beside all steps.
     """
 
     recording: Straightened
@@ -72,7 +79,7 @@ class Found:
     steps: tuple[Trial, ...]
     notes: tuple[str, ...] = ()
     tried: tuple[Tried, ...] = ()
-    like: Mapping[str, str] = field(default_factory=dict)
+    like: Mapping[str, Reading] = field(default_factory=dict)
     laws: tuple[Trial, ...] = ()
 
     def with_only(self, values: Mapping[str, Values]) -> Found:

@@ -64,7 +64,7 @@ def diagnosis_page(
         variants[(True,) * len(steps)] = found.written
     fields = {
         "kind": "diagnosis",
-        "headline": text.headline(found.verdict, [finding.effect for finding in found.ranking], bool(names["profile"])),
+        "headline": text.headline(found.verdict, [finding.name for finding in found.ranking], bool(names["profile"])),
         "findings": [_finding(finding) for finding in found.ranking],
         "command": text.next_command(found, names, names.get("apply") if outcome else None).split(" "),
         "left": text.sentence(found.evidence) if found.evidence else "",

@@ -160,7 +160,7 @@ def diagnosis_lines(found: Diagnosis, calibrated: bool = True) -> list[str]:
 
 
 def _verdict(found: Diagnosis, calibrated: bool) -> str:
-    said = headline(found.verdict, [finding.effect for finding in found.ranking], calibrated)
+    said = headline(found.verdict, [finding.name for finding in found.ranking], calibrated)
     return f"verdict     {found.verdict}: {said}"
 
 
@@ -239,8 +239,9 @@ def _finding(rank: int, finding: Finding) -> list[str]:
 
 
 def heading(finding: Finding) -> str:
-    """Name a finding; a free law with the listed effect that it is most like."""
-    return title(finding.effect) + (f", most like {spoken(finding.like)}" if finding.like else "")
+    """Name a finding; a free law by the listed effect whose few numbers bring a share of its gain."""
+    share = f", {100 * finding.like.share:.0f} % of {spoken(finding.effect)}" if finding.like else ""
+    return title(finding.name) + share
 
 
 def chance(finding: Finding) -> str:

@@ -14,12 +14,14 @@ from scipy import ndimage, signal
 
 from edgefilter import add, compare, load_effect
 from edgefilter.diagnosis.criteria import Criteria
+from edgefilter.diagnosis.findings import findings_of
 from edgefilter.diagnosis.laws import Law, law_of, with_laws
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.recording import diagnose
 from edgefilter.diagnosis.trials import Found, Trial
 from edgefilter.echo.effects import catalogue
 from edgefilter.echo.running import stream_form
+from edgefilter.report.text import heading
 from edgefilter.types import SAMPLE_RATE
 from tests.diagnosis.robot_scene import profile, record, voice
 
@@ -193,7 +195,16 @@ def test_a_law_in_place_of_a_name_that_leaves_much_says_what_it_is_most_like_and
     score = found.recording.of(start)
     named = replace(found, model=start, final=score, steps=(Trial.of("compression", start, found.base, score),))
     better = with_laws(named, Criteria())
-    assert [step.name for step in better.steps] == ["free_gain"] and better.like == {"free_gain": "compression"}
+    (step,) = better.steps
+    assert step.name == "free_gain" and list(better.like) == ["free_gain"]
+    name, share = better.like["free_gain"]
+    assert name == "compression"
+    assert share == pytest.approx(named.steps[0].gain_db / step.gain_db), (
+        "of what the law brings, what the name's numbers do"
+    )
+    (finding,), _ = findings_of(better, None)
+    assert (finding.effect, finding.name) == ("free_gain", "compression")
+    assert heading(finding) == f"Compression, {100 * share:.0f} % of a gain by level"
     knowing, before, after = add(profile(), "free_gain", y, X)
     assert after.excess_db < 0.4 * before.excess_db and np.ndim(dict(knowing.echo.effects)["free_gain"]["gain_db"]) == 1
 
