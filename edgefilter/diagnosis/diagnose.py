@@ -9,7 +9,6 @@ import numpy as np
 
 from edgefilter.diagnosis.advice import advice, asks
 from edgefilter.diagnosis.candidates import candidates
-from edgefilter.diagnosis.closer_look import look_closer
 from edgefilter.diagnosis.compare import Comparison, describe, independence_of
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.findings import evidence_of, findings_of
@@ -96,7 +95,6 @@ def conclude(
         else comparison.independence,
         precision=precision(found, findings),
         advice=(*advice(tried), *asks(tried)),
-        closer_look=look_closer(found) if verdict == "unexplained" else None,
         law=law_of(found),
     )
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
-from edgefilter.diagnosis.closer_look import Curve
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.ordinary import p_value
 from edgefilter.diagnosis.trials import Found, Reading, Trial, added
 from edgefilter.echo.effect import vanishes
 from edgefilter.echo.effects.catalogue import EFFECTS, find
+from edgefilter.echo.effects.free_laws import FreeLaw
 from edgefilter.echo.measurement import Values
 from edgefilter.errors import UsageError
 
@@ -36,6 +36,33 @@ class {class_name}({base}):
     def fit(self, measurement, model):
         return FOUND
 '''
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A law drawn: x and y (k,), a gain unless y_unit says otherwise; share: part of what is left without it that it explains."""
+
+    name: str
+    x_unit: str
+    x: tuple[float, ...]
+    y_db: tuple[float, ...]
+    share: float
+    y_unit: str = "dB"
+
+    @classmethod
+    def of(cls, law: Trial) -> Curve:
+        """That of a free law that was fitted; share: of the level over the silences."""
+        effect = find(law.name)
+        assert isinstance(effect, FreeLaw)
+        name, unit, x, y, y_unit = effect.drawn(law.values)
+        left = law.gain_db + law.score.over_db - law.score.floor_db
+        share = float(np.clip(law.gain_db / max(left, 1e-9), 0.0, 1.0))
+        return cls(name, unit, tuple(map(float, x)), tuple(map(float, y)), share, y_unit)
+
+    def to_dict(self) -> dict[str, object]:
+        """Ready for JSON."""
+        rounded = {"x": np.round(self.x, 3).tolist(), "y_db": np.round(self.y_db, 2).tolist()}
+        return {**asdict(self), **rounded, "share": round(self.share, 4)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +114,7 @@ def law_of(found: Found) -> Law | None:
         return None
     step = max(laws, key=lambda step: step.gain_db)
     effect, others = find(step.name), tuple(one.name for one in found.steps if one is not step)
-    words, curve, excess_db = effect.sentence(step.values), Curve.of_law(step), found.final.excess_db
+    words, curve, excess_db = effect.sentence(step.values), Curve.of(step), found.final.excess_db
     return Law(step.name, effect.family, words, curve, others, step.gain_db, excess_db, step.values)
 
 
@@ -110,7 +137,6 @@ def with_laws(
         names = {step.name for step in found.steps}
         if not (tried := list(_trials(found, progress, without))):
             break
-        found = replace(found, laws=tuple(law for law in tried if names <= dict(law.model.effects).keys()))
         tried = [law for law in tried if law.gain_db >= criteria.part * left]
         instead = [law for law in tried if not names <= dict(law.model.effects).keys()]
         beside = [law for law in tried if law not in instead and law.p_value <= criteria.false_rate]

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
-from edgefilter.diagnosis.closer_look import CloserLook
 from edgefilter.diagnosis.compare import Comparison, rounded
 from edgefilter.diagnosis.independence import Independence
 from edgefilter.diagnosis.laws import Law
@@ -144,8 +143,7 @@ class Diagnosis:
     what is left with all that was found. precision: of the found numbers. advice: what to record to tell candidates
     apart that explain nearly the same. proof: of what was found, in the running filter, where it was asked for;
     unproven: why there is none. written: the comparison with the profile that was written of it, whose figures it then
-    has. closer_look: at what is left, where that is unexplained; law: the free one that explains much more of it than
-    what is named.
+    has. law: the free one that explains much more of it than what is named.
     """
 
     verdict: Verdict
@@ -162,7 +160,6 @@ class Diagnosis:
     proof: Proof | None = None
     unproven: str = ""
     written: Comparison | None = None
-    closer_look: CloserLook | None = None
     law: Law | None = None
 
     def to_dict(self) -> dict[str, object]:
@@ -198,12 +195,11 @@ class Diagnosis:
             "advice": list(self.advice),
             "proof": _dict_of(self.proof),
             "unproven": self.unproven,
-            "closer_look": _dict_of(self.closer_look),
             "law": _dict_of(self.law),
         }
 
 
-def _dict_of(part: Independence | Proof | CloserLook | Law | None) -> dict[str, object] | None:
+def _dict_of(part: Independence | Proof | Law | None) -> dict[str, object] | None:
     return part.to_dict() if part else None
 
 

@@ -68,7 +68,7 @@ class Found:
     """The outcome of a search from a start model.
 
     steps: the accepted effects in their order. notes: what the reader must know of the search. tried: every effect that
-    was fitted. like: of a free law the name that it replaces. laws: those that were fitted beside all steps.
+    was fitted. like: of a free law the name that it replaces.
     """
 
     recording: Straightened
@@ -80,7 +80,6 @@ class Found:
     notes: tuple[str, ...] = ()
     tried: tuple[Tried, ...] = ()
     like: Mapping[str, Reading] = field(default_factory=dict)
-    laws: tuple[Trial, ...] = ()
 
     def with_only(self, values: Mapping[str, Values]) -> Found:
         """The outcome with nothing but these effects, each with what it explains beside those before it."""

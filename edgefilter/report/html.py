@@ -14,7 +14,6 @@ import jinja2
 import numpy as np
 
 from edgefilter.audio.files import whole
-from edgefilter.diagnosis.closer_look import CloserLook
 from edgefilter.diagnosis.compare import Comparison, describe
 from edgefilter.diagnosis.laws import Law
 from edgefilter.diagnosis.passport import ENOUGH_DB, Passport
@@ -44,7 +43,7 @@ def comparison_page(found: Comparison, names: Mapping[str, Any]) -> str:
     """
     profile = "The profile" if names["profile"] else "A stationary linear path made from the recording itself"
     excess = f"{profile} leaves {text.decibels(found.excess_db)} dB over the noise floor unexplained."
-    none: dict[str, object] = {"findings": [], "command": [], "left": "", "look": None}
+    none: dict[str, object] = {"findings": [], "command": [], "left": "", "law": None}
     return _page({(): found}, (), {"kind": "comparison", "headline": excess, **none, **_statistics()}, names)
 
 
@@ -68,7 +67,7 @@ def diagnosis_page(
         "findings": [_finding(finding) for finding in found.ranking],
         "command": text.next_command(found, names, names.get("apply") if outcome else None).split(" "),
         "left": text.sentence(found.evidence) if found.evidence else "",
-        "look": _look(found.closer_look, found.law),
+        "law": _law(found.law),
         **_statistics(found),
     }
     return _page(variants, steps, fields, names, found.irreducible_db, outcome)
@@ -240,28 +239,25 @@ def _facts(before: Comparison, after: Comparison | None, irreducible_db: float |
     return facts
 
 
-def _look(look: CloserLook | None, law: Law | None) -> dict[str, object] | None:
-    """The curves, of the law first, as points of drawings 100 wide and 40 high; zero: the height of 0 dB."""
-    if look is None and law is None:
+def _law(law: Law | None) -> dict[str, str] | None:
+    """The law in words, its curve as points of a drawing 100 wide and 40 high; zero: the height of 0 dB."""
+    if law is None:
         return None
-    drawn = []
-    for curve in (*((law.curve,) if law else ()), *(look.curves if look else ())):
-        low, high = min(0.0, *curve.y_db), max(0.0, *curve.y_db)
-        x = np.log(curve.x) if curve.x_unit == "Hz" else np.array(curve.x)
-        across, up = max(float(x[-1] - x[0]), 1e-9), max(high - low, 1.0)
-        points = zip(100 * (x - x[0]) / across, 40 * (high - np.array(curve.y_db)) / up, strict=True)
-        drawn.append(
-            {
-                "name": f"{law.family}: the law by {curve.name}" if law and curve is law.curve else f"by {curve.name}",
-                "points": " ".join(f"{a:.2f},{b:.2f}" for a, b in points),
-                "zero": f"{40 * high / up:.2f}",
-                "from": f"{curve.x[0]:.3g}",
-                "to": f"{curve.x[-1]:.4g} {curve.x_unit}",
-                "range": f"{low:+.1f} to {high:+.1f} {curve.y_unit}".replace("-", "−"),
-            }
-        )
-    said = {"law": text.sentence(law.words) if law else "", "family": law.family if law else ""}
-    return {"sentence": text.sentence(look.sentence) if look else "", "curves": drawn, **said}
+    curve = law.curve
+    low, high = min(0.0, *curve.y_db), max(0.0, *curve.y_db)
+    x = np.log(curve.x) if curve.x_unit == "Hz" else np.array(curve.x)
+    across, up = max(float(x[-1] - x[0]), 1e-9), max(high - low, 1.0)
+    points = zip(100 * (x - x[0]) / across, 40 * (high - np.array(curve.y_db)) / up, strict=True)
+    return {
+        "words": text.sentence(law.words),
+        "family": law.family,
+        "name": f"{law.family}: the law by {curve.name}",
+        "points": " ".join(f"{a:.2f},{b:.2f}" for a, b in points),
+        "zero": f"{40 * high / up:.2f}",
+        "from": f"{curve.x[0]:.3g}",
+        "to": f"{curve.x[-1]:.4g} {curve.x_unit}",
+        "range": f"{low:+.1f} to {high:+.1f} {curve.y_unit}".replace("-", "−"),
+    }
 
 
 def _finding(finding: Finding) -> dict[str, object]:

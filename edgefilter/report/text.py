@@ -175,10 +175,9 @@ def _left(found: Diagnosis) -> str:
 
 
 def _hints(found: Diagnosis) -> list[str]:
-    """Say where to look closer, and which law was found."""
-    look = [f"closer      {sentence(found.closer_look.sentence)}"] if found.closer_look else []
+    """Say which law was found."""
     own = "--write-effect MINE.py writes it as your own effect"
-    return look + ([f"law         {found.law.family}: {found.law.words}; {own}"] if found.law else [])
+    return [f"law         {found.law.family}: {found.law.words}; {own}"] if found.law else []
 
 
 def _proof(found: Diagnosis) -> list[str]:

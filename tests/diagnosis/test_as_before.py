@@ -27,7 +27,6 @@ def told(found: Diagnosis) -> dict:
     tried = [
         {name: one[name] for name in ("effect", "verdict", "why", "gain_db", "beside_db")} for one in known["tried"]
     ]
-    curves = known["closer_look"] and known["closer_look"]["curves"]
     plain = ("verdict", "excess_db", "remaining_db", "evidence", "where", "advice", "law", "warnings")
     zones = known["independence"]["of_findings"]["zones"] if known["independence"]["of_findings"] else []
     depends = [(zone["meaning"], zone["share"]) for zone in zones]
@@ -35,7 +34,6 @@ def told(found: Diagnosis) -> dict:
         **{name: known[name] for name in plain},
         "ranking": ranking,
         "tried": tried,
-        "curves": curves,
         "depends": depends,
     }
 

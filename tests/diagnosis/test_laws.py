@@ -15,7 +15,7 @@ from scipy import ndimage, signal
 from edgefilter import add, compare, load_effect
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.findings import findings_of
-from edgefilter.diagnosis.laws import Law, law_of, with_laws
+from edgefilter.diagnosis.laws import Curve, Law, law_of, with_laws
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.recording import diagnose
 from edgefilter.diagnosis.trials import Found, Trial
@@ -237,3 +237,10 @@ def test_where_no_voice_is_there_to_fit_to_there_is_no_law() -> None:
     mute = replace(prepared, measurement=replace(prepared.measurement, fit=np.zeros(X.size, bool)))
     score = mute.of(mute.model)
     assert law_of(with_laws(Found(mute, mute.model, mute.model, score, score, ()), Criteria())) is None
+
+
+def test_a_curve_is_written_with_as_many_digits_as_mean_something() -> None:
+    curve = Curve("gain by level", "dB", (1 / 3,), (2 / 3,), 1 / 7)
+    assert curve.to_dict() == {
+        **{"name": "gain by level", "x_unit": "dB", "x": [0.333], "y_db": [0.67], "share": 0.1429, "y_unit": "dB"}
+    }

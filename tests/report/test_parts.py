@@ -13,7 +13,7 @@ import soundfile
 from PIL import Image
 
 from edgefilter.audio.channels import Channels
-from edgefilter.diagnosis.closer_look import CloserLook, Curve
+from edgefilter.diagnosis.laws import Curve, Law
 from edgefilter.diagnosis.recording import Recording, compare
 from edgefilter.diagnosis.result import Diagnosis, Finding, Interval
 from edgefilter.echo.effects.catalogue import EFFECTS, find
@@ -206,15 +206,17 @@ def test_four_effects_give_five_comparisons_in_the_page():
     )
 
 
-def test_the_page_of_what_is_unexplained_draws_a_closer_look_and_says_where():
+def test_the_page_draws_the_law_that_was_found():
     x, robot = voice(3.0), profile()
     y = record(x)
-    look = CloserLook((Curve("time", "s", (0.1, 0.2, 0.3), (-3.0, 1.0, 0.0), 0.5),), "look at the gain by time")
-    found = Diagnosis("unexplained", compare(robot, y, x), (), "", 9.0, 0.0, robot.echo, closer_look=look)
+    curve = Curve("time", "s", (0.1, 0.2, 0.3), (-3.0, 1.0, 0.0), 0.5)
+    law = Law("free_modulation", "modulation", "a gain that moves", curve, (), 1.0, 2.0, {})
+    found = Diagnosis("unexplained", compare(robot, y, x), (), "", 9.0, 0.0, robot.echo, law=law)
     page = diagnosis_page(Recording(y, x, robot), found, {"profile": "p", "recording": "m", "reference": "r"})
-    assert "<b>Look at the gain by time.</b>" in page and "By time</b> <small>−3.0 to +1.0 dB" in page
+    assert "<b>modulation</b>: A gain that moves." in page
+    assert "Modulation: the law by time</b> <small>−3.0 to +1.0 dB" in page
     assert 'points="0.00,40.00 50.00,0.00 100.00,10.00"' in page and 'y1="10.00"' in page
-    assert "closer      Look at the gain by time." in diagnosis_lines(found)
+    assert any(line.startswith("law         modulation: a gain that moves; ") for line in diagnosis_lines(found))
 
 
 def test_the_command_to_add_is_one_that_a_shell_reads():
