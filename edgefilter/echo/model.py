@@ -164,7 +164,9 @@ class EchoModel:
         return self._with_those(lambda other, _: other != name)
 
     def _with_those(self, kept: Callable[[str, Values], bool]) -> EchoModel:
-        return replace(self, effects=tuple(entry for entry in self.effects if kept(*entry)))
+        """Only those effects; the model itself where that is all, so that what is remembered of it is found again."""
+        effects = tuple(entry for entry in self.effects if kept(*entry))
+        return self if len(effects) == len(self.effects) else replace(self, effects=effects)
 
     def fit(self, name: str, measurement: Measurement) -> EchoModel:
         """The model with that effect at the values that explain the measurement best."""

@@ -18,8 +18,10 @@ from edgefilter.diagnosis.select import search
 from edgefilter.diagnosis.straightened import Score, bands
 from edgefilter.diagnosis.trials import Found, Trial, Workbench
 from edgefilter.dsp.fractional_delay import delayed
+from edgefilter.echo.effects import early_path, late_reverb
 from edgefilter.echo.effects.bandlimit import band_edge
 from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.effects.late_reverb import fit_path
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.wiener import spectra
 from edgefilter.types import PRE_ROLL
@@ -239,6 +241,21 @@ def test_what_ordinary_recordings_show_more_of_than_is_left_is_not_fitted():
     assert bench.attempt("speaker_nonlinearity", model) is None
     (row,) = bench.tried(model, model)
     assert (row.name, row.spared, row.alone) == ("speaker_nonlinearity", True, None)
+
+
+def test_two_effects_that_share_a_fit_make_it_once_beside_one_model(monkeypatch):
+    made = []
+
+    def counted(measurement, model):
+        made.append(model)
+        return fit_path(measurement, model)
+
+    for module in (early_path, late_reverb):
+        monkeypatch.setattr(module, "fit_path", counted)
+    bench = Workbench(prepare(profile(), record(voice(4.0), EchoModel(path(seed=2))), voice(4.0)), Criteria())
+    trials = [bench.attempt(name, bench.recording.model) for name in ("early_path", "late_reverb")]
+    assert sum(trial is not None for trial in trials) == 1, "one of the two names for one fit"
+    assert len(made) == 1
 
 
 def verdict(active_db: float) -> Score:
