@@ -19,7 +19,7 @@ from edgefilter.alignment.delay_line import (
     read_line,
 )
 from edgefilter.alignment.delay_tracker import DRIFTED, FAINT, SIZE, STRIDE, DelayMeasurement, DelayMeter, DriftFilter
-from edgefilter.alignment.lag_search import CERTAIN, MINIMUM, MOST_LAG_S, REFLECTIONS, SEEN_ODDS, Found, LagSearch
+from edgefilter.alignment.lag_search import ALIKE, CERTAIN, MINIMUM, MOST_LAG_S, REFLECTIONS, Found, LagSearch
 from edgefilter.alignment.utterances import AHEAD, Announcements, FirstSounds, OnsetDetector, Playback, Utterance
 from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, AlignmentCounts, AlignmentState, AlignmentStats, Samples
@@ -247,19 +247,30 @@ class Aligner:
             self._lags.listen({at: self._mics[at] for at in together}, now, heard_out)
         elif stage == 2:
             found = self._lags.find()
-            if found is not None and found.old and found.odds * SEEN_ODDS > CERTAIN:
-                self._found, self._stage = found, 3
-            # a reference that comes after its echo is rare: two windows must show it
-            fresh = found is not None and not found.old and found.lag >= -WAIT and found.odds > CERTAIN
-            return found is not None and fresh and self._take(found)
+            return found is not None and self._weigh(found, looked_back=False)
         elif found := self._found:
             first, ref = self._used[0], self._expected or self._ref
-            return self._lags.before(first, self._mics[first], ref, found) and self._take(found)
+            return self._weigh(self._lags.before(first, self._mics[first], ref, found), looked_back=True)
+        return False
+
+    def _weigh(self, found: Found, looked_back: bool) -> bool:
+        """Believe a lag, give it up, or look back at what was heard before, if anything was; True if the delay was switched.
+
+        A sequential test (Wald 1945): each window that is looked back at changes the odds, until they are certain or too low.
+        """
+        # a reference that comes after its echo is rare: two windows must show it
+        alone = found.lag >= -WAIT and not found.old
+        if found.odds > CERTAIN and (looked_back or alone):
+            return self._take(found)
+        alike = self._responses is not None or self._known or self._coarse
+        least = CERTAIN * ALIKE if alike else 1.0 / CERTAIN
+        if found.old and found.odds > least and not (alike and looked_back):
+            self._found, self._stage = found, 3
         return False
 
     def _take(self, found: Found) -> bool:
         """Accept this lag as the robot's; return whether the delay of the reference has changed."""
-        self._log_odds = min(math.log(found.odds * (SEEN_ODDS if found.old else 1.0)), SUREST)
+        self._log_odds = min(math.log(found.odds), SUREST)
         if self._expected is not None:
             return self._begin(self._expected.start + found.lag)
         was_refuted = self._refuted
@@ -379,7 +390,9 @@ class Aligner:
         if abs(start - self._read_at) > 0.5:
             start, switched = self._read_at - self._drift.slope * self.hop, True
         reference = read_delayed(self._ref, end, self.hop, start, self._read_at)
-        if self._known and self._open and not self._refuted and end - self._drift.delay > self._open[0].start:
+        # one that is lost may only have moved away, and be softer there
+        begun = self._known and self._open and not self._open[0].lost
+        if begun and not self._refuted and end - self._drift.delay > self._open[0].start:
             self._refuted = self._cannot_be(mic)
         if self._refuted:
             reference = np.zeros(self.hop, np.float32)

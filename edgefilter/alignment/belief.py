@@ -11,7 +11,16 @@ import numpy as np
 from scipy.special import expit
 
 from edgefilter.alignment.delay_line import WAIT, DelayBuffer
-from edgefilter.alignment.lag_search import CERTAIN, EARLY_ODDS, MOST_LAG_S, NEAR, REFLECTIONS, Found, LagSearch
+from edgefilter.alignment.lag_search import (
+    CERTAIN,
+    EARLY_ODDS,
+    MISSED,
+    MOST_LAG_S,
+    NEAR,
+    REFLECTIONS,
+    Found,
+    LagSearch,
+)
 from edgefilter.dsp.frames import decibels, stretch
 from edgefilter.dsp.lag import correlation_near, flat_cross, highest
 from edgefilter.errors import SignalError
@@ -26,8 +35,6 @@ SAME = 32
 """Samples by which the lags of two looks may differ and be one lag: what clocks and a person who walks move it by."""
 JUMP = 0.2
 """Probability that from one look to the next the lag is another: utterances last some 5 s, and each may have its own."""
-MISSED = 0.3
-"""Probability that a second in which the robot is heard does not show its lag: in 19 real recordings .21 of the seconds did not."""
 CLEAR_DB, LEADS = 0.5, 80
 """Reverberation after its sound over what is before it, 0.5 to 8 dB in 33 real pairs, tuned on, and as much below zero where they are
 swapped; where a reflection is louder than the direct sound it is the other way round, so a lag of more than LEADS samples is no sign of

@@ -231,6 +231,35 @@ def test_a_lag_is_the_likelier_the_clearer_it_is_and_the_less_so_where_the_refer
     assert Found(-300, 2.1).odds < 0.1 * Found(20, 2.1).odds
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_robot_in_loud_rumble_is_found_where_no_window_alone_is_certain_but_several_agree(seed):
+    rng = np.random.default_rng(seed)
+    ref, _ = utterances(rng, [5.0], [0.5])
+    mic, truth = hear(ref, [(0, 9000)], room(rng, 0.6))
+    hops = run(Aligner(256), (mic + fan(rng, mic.size, 32 * np.std(mic))).astype(np.float32), ref)
+    found = [at for at, hop in enumerate(hops) if hop.state == "locked"]
+    assert found and 256 * found[0] < RATE // 4 + 9000 + 3 * RATE  # with one earlier window, one of four
+    assert abs(hops[found[0]].delay - truth[256 * found[0]]) < 24
+
+
+def test_a_look_back_raises_the_odds_of_a_lag_that_it_shows_and_lowers_those_of_another():
+    rng = np.random.default_rng(3)
+    said = speech_like(rng, 2.0)
+    heard = np.concatenate((np.zeros(4000, np.float32), said[:-4000])) + fan(rng, said.size)
+    mic, ref = DelayBuffer(said.size), DelayBuffer(said.size)
+    mic.push(heard.astype(np.float32))
+    ref.push(said)
+    search = LagSearch(25600)
+    for lag in (4000, 5000):
+        first = Found(lag, 1.4, at=said.size, heard=said.size - lag)
+        second = search.before(0, mic, ref, first)
+        assert (second.lag, second.at, second.heard) == (lag, first.at - 8192, first.heard - 8192)
+        assert second.odds > 100 if lag == 4000 else 0.2 * first.odds < second.odds < 0.5 * first.odds
+        # a short sound may agree entirely: however clear it is, more must be seen than it
+        clear = search.before(0, mic, ref, Found(lag, 100.0, at=said.size, heard=said.size - lag))
+        assert clear.odds > 100 if lag == 4000 else 20 < clear.odds < 50
+
+
 def test_no_step_of_a_search_comes_twice_in_a_hop(monkeypatch):
     rng = np.random.default_rng(13)
     ref, _ = utterances(rng, [3, 3], [1.5, 1.5])

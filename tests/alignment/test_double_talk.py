@@ -155,6 +155,17 @@ def test_a_robot_that_is_not_seen_for_a_moment_is_lost_not_begun():
     )
 
 
+def test_the_reference_of_a_robot_that_moves_away_while_it_talks_is_not_withheld():
+    rng = np.random.default_rng(0)
+    ref, near = speech_like(rng, 8.0), room(rng, 0.3)
+    diffuse = rng.standard_normal(8000) * np.exp(-np.arange(8000) / 1500)
+    diffuse *= 0.2 * np.sqrt(np.sum(near**2) / np.sum(diffuse**2))  # 14 dB softer, no sharp arrival
+    at_first, later = (np.convolve(ref, response) for response in (near, diffuse))
+    mic = np.concatenate((np.zeros(900), at_first[:64000], later[64000 : ref.size - 900]))
+    hops = run(Aligner(256), (mic + fan(rng, mic.size, 5e-4)).astype(np.float32), ref)[270:]
+    assert any(hop.state == "lost" for hop in hops) and all(hop.reference.any() for hop in hops)
+
+
 def test_a_robot_that_is_hidden_is_lost_after_three_looks_two_hops_apart():
     rng = np.random.default_rng(32)
     ref, _ = utterances(rng, [8], [1])
