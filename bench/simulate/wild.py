@@ -54,7 +54,7 @@ class Command:
     run: Callable[[Array], Array]
 
     def __call__(self, x: Array) -> Array:
-        """Put x (n,) through the program, and back in time by whole samples; ends where what comes out is not all numbers."""
+        """Run x (n,) through the program and undo its delay in whole samples; exits where the output is not finite."""
         y = self.run(x)
         if wrong := int(np.count_nonzero(~np.isfinite(y))):
             sys.exit(

@@ -40,11 +40,11 @@ CERTAIN = 100.0
 """Odds from which on a lag is believed, and the odds against it from which on it is given up: while a human and an unheard robot
 talk all the time, a wrong one in an hour."""
 ALIKE = 0.05
-"""Probability that all looks err alike: at a reflection while the arrival is followed, on a path without a sharp one, by a calibrated
-path of another place. Many raise the odds by no more than one over this, so one is looked back at, for a lag with this part of
-CERTAIN or more."""
+"""Probability that all looks share one error: a reflection taken for the direct sound, a path without a sharp peak, a path that was
+calibrated elsewhere. However many there are, looks raise the odds by 1/ALIKE at most: where that may be so one earlier look
+is taken, and only for a lag with odds of CERTAIN * ALIKE or more."""
 MISSED = 0.3
-"""Probability that a second in which the robot is heard does not show its lag: in 19 real recordings .21 of the seconds did not."""
+"""Probability that a second with audible robot has no peak at its lag: .21 of the seconds in 19 real recordings had none."""
 
 
 @dataclass(frozen=True, slots=True)

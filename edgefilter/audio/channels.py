@@ -69,9 +69,9 @@ class Channels:
         return "all" if self.mics is None else ",".join(map(str, self.mics))
 
     def among(self, there: int, what: str, error: type[EdgefilterError] = UsageError) -> list[int]:
-        """Give the numbers, the reference's last, of what has so many channels.
+        """Return the channel numbers from 0, the reference's last, for a source with so many channels.
 
-        Raises UsageError where all are wanted and are more than eight, and error where a named one is not there.
+        what: the source, for messages. Raises UsageError where 'all' are more than eight, `error` where a named one is missing.
         """
         if self.mics is None:
             if there > MOST_MICROPHONES:

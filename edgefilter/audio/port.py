@@ -76,8 +76,8 @@ def quiet() -> Iterator[None]:
 class Port:
     """One PortAudio stream and how its rate and channels are brought to 16 kHz mono.
 
-    latency_s: the buffer asked of the sound system, seconds. wanted: an input's channels, to be delivered in that
-    order in place of their mean. Raises DeviceError where the device cannot be opened, UsageError where it lacks a channel.
+    latency_s: the buffer asked of the sound system, seconds. wanted: of an input, the channels to deliver, in that order;
+    None for the mean of all. Raises DeviceError where the device cannot be opened, UsageError where it lacks a wanted channel.
     """
 
     def __init__(

@@ -13,15 +13,15 @@ class Lateness:
     """When sound that is late counts as lost; seconds of delay or of waiting. Raises UsageError for what cannot be."""
 
     look_s: float = 0.15
-    """How long a small delay must last: longer than transports of 100 ms are quiet."""
+    """How long a small delay must last to count as lost sound: longer than the pause between packets of 100 ms."""
     stall_s: float = 0.25
-    """A delay that counts after a tenth of look_s: a program that stood still for so long finds all that it has missed waiting."""
+    """A delay of so much counts after `least_look` of look_s: a program that had stalled for so long would have read all that waited."""
     held_s: float = 0.1
-    """Lateness of a block from which on its samples wait until it is clear whether some were lost."""
+    """How late a block must be for its samples to be held back until it is clear whether some were lost."""
     tolerance_s: float = 0.01
     """Delay that comes and goes with the phase of callbacks."""
     least_look: float = 0.1
-    """Part of look_s that is waited at least: what stood still finds everything else waiting, and is on time at once."""
+    """Least part of look_s for which a delay must last, however large: a program that stalled is on time again at its next call."""
     drift: float = 5e-4
     """Largest difference of two clocks: by so much a delay may grow without a loss."""
 
@@ -34,10 +34,9 @@ class Lateness:
 class SampleClock:
     """Compares what a source has delivered with the clock.
 
-    Late sound catches up, lost sound does not: a delay that has grown counts as a loss once it was never smaller for a
-    while, look_s for a small one, and shorter the nearer it is to stall_s. What comes after all is taken off again. missed:
-    seconds lost so far. drifted: seconds by which the source's clock has fallen behind besides.
-    doubt_s: delay of which it is not clear yet whether it is a loss.
+    Late sound catches up, lost sound does not: a delay that has grown counts as a loss once it has not shrunk for look_s, or
+    for less the nearer it is to stall_s. Sound that arrives after all is subtracted again. missed: seconds lost so far.
+    drifted: further seconds by which the source's clock has fallen behind. doubt_s: delay that may still prove a loss.
 
     >>> clock = SampleClock()
     >>> [round(clock.note(now - 0.2 * (now > 1.0), now), 3) for now in (0.0, 0.5, 1.0, 1.1, 1.2)]

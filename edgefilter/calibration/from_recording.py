@@ -46,11 +46,11 @@ class PathFit:
     most_ppm: float = 400.0
     """Largest drift that is looked for."""
     step_ppm: float = 2.0
-    """Between two drifts that are tried: it moves a lag by one sample in half a minute."""
+    """Step of the drifts that are tried: 2 ppm move a lag by one sample in half a minute."""
     drift_gain: float = 1.1
-    """By this factor the correlation along a sloping line must exceed that along a level one."""
+    """Least ratio of the correlation along a sloping line to that along a level one for a drift to be believed."""
     upsampled: int = 4
-    """Places of a correlation for each sample, so that a line crosses it in steps of a quarter."""
+    """Oversampling of the correlation, so that a line can be followed in quarters of a sample."""
     least_frames: int = 8
     """Of silence: with fewer the quietest frames stand in for it."""
 
@@ -141,10 +141,10 @@ def _drifting(x: Samples, ppm: float) -> Samples:
 
 
 def find_drift(recording: Samples, reference: Samples) -> tuple[float, int]:
-    """The line along which recording (n,) lags behind reference (n,): its slope in ppm, and where it starts, in samples.
+    """Fit the lag of recording (n,) behind reference (n,) by a line over time: drift in ppm, and the first lag in samples.
 
-    Of all lines of up to FIT.most_ppm the one on which the correlations of windows of a second, spectra flattened, add up to
-    most; 0 ppm where it brings less than FIT.drift_gain of what no drift does. Lags of up to DRIFT_REACH.
+    Of the lines of up to FIT.most_ppm the one with the largest sum of whitened cross-correlations of windows of 1 s; 0 ppm
+    where that sum is less than FIT.drift_gain times the one without a drift. Lags of up to DRIFT_REACH samples.
     """
     size, part = 4 * SAMPLE_RATE, slice(2 * SAMPLE_RATE, 3 * SAMPLE_RATE)
     padded = np.pad(reference, (2 * SAMPLE_RATE, 2 * SAMPLE_RATE))
@@ -180,9 +180,9 @@ def silences(reference: Samples) -> NDArray[np.bool_]:
 
 
 def fan_in_silences(recording: Samples, silent: NDArray[np.bool_]) -> tuple[Samples, float]:
-    """PSD of the quieter half of the silent frames, (601,) float32, and how many seconds those are.
+    """Noise PSD (601,) float32 of the quieter half of the frames in which the robot is silent, and their seconds.
 
-    Where silent (n,) leaves fewer than FIT.least_frames, that of the quietest twentieth of all frames, and 0 seconds.
+    silent: (n,), of each sample. With fewer than FIT.least_frames such frames: PSD of the quietest 5 % of all, and 0 seconds.
     """
     step = GRID_FFT // 2
     power = periodograms(recording, GRID_FFT)

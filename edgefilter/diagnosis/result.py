@@ -76,7 +76,7 @@ class Finding:
 
     @property
     def name(self) -> str:
-        """The listed effect that it is known by: its own name but for a free law."""
+        """Name in the list of effects: that of the effect itself, of a free law that of the named effect which it replaced."""
         return self.like.name if self.like else self.effect
 
 

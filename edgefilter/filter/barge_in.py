@@ -34,7 +34,7 @@ starts, with 0.03 there are 7, and 47 humans in time."""
 class BargeInSettings:
     """When speech counts as begun and as ended.
 
-    threshold: probability at which somebody is suspected to speak; later hops above it speak for a human, those below for
+    threshold: probability at which somebody is suspected to speak; later hops above it count for a human, those below for
     the robot. Higher (0.985) for a robot that must not be stopped by its own loudspeaker or a running tap, at the price of
     the softest humans and some 20 ms; lower (0.9) for one that would rather stop once too often. confirm_s: how long the
     later hops are weighed at most until speech has begun, or was none; half of all beginnings are clear after 50 ms. With 0

@@ -96,9 +96,9 @@ class Topics:
     """Names of what comes in and goes out.
 
     rate: Hz, of the microphone's and the reference's 16-bit samples. channels: of the microphone's. reference_channels:
-    of the reference's topic, None for as many as the microphone's. array: those of the microphone's that are microphones
-    of an array, and the one in place of the topic of the reference; the human is then one channel, otherwise as many as
-    came in, of their mean.
+    of the reference's topic, None for as many as the microphone's. array: which channels of the microphone's topic are the
+    microphones of an array, and which one is the reference, in place of its topic. The output then has one channel,
+    otherwise as many as came in, all of them the filtered mean.
     """
 
     mic: str

@@ -25,11 +25,11 @@ class Limits:
     """How much a client of `edgefilter serve` may make the server hold, wait and compute. UsageError where one is not above 0."""
 
     message: int = 4_000_000
-    """Bytes of a message: an announced utterance of 40 s at 48 kHz; of sound some 20 ms are usual."""
+    """Most bytes in a message: an announced utterance of 40 s at 48 kHz; sound usually comes in 20 ms."""
     frames: int = 1000
-    """Of a message: of at least `read_at_once` where it is as long as may be."""
+    """Most frames in a message: the longest message then has frames of `read_at_once` bytes."""
     text: int = 4096
-    """Characters of a message in JSON: a hundred times those of the longest that means something."""
+    """Most characters in a JSON message: a hundred times the longest valid one."""
     read_at_once: int = 4096
     """Bytes that are read of a client before others have their turn, 20 ms of two channels at 48 kHz: in frames without
     content, of 6 bytes, these take 5 ms."""
@@ -50,19 +50,19 @@ class Limits:
     idle_s: float = 60.0
     """Timeout for every later message."""
     pings: int = 100
-    """In a row, with no message between them."""
+    """Most pings in a row, with no message between them."""
     unread: int = 1 << 16
     """Bytes of answers, those to pings among them, that wait for the client to read them."""
     guests: int = 16
     """Connections that have no stream yet, or none any more; where one more comes, the oldest of them is cut off."""
     jitter_s: float = 0.06
-    """For how long a message that is missing is waited for: three of 20 ms."""
+    """How long a missing message is waited for: three of 20 ms."""
     gap_s: float = 10.0
     """Longest gap that is filled with silence; a counter that jumps further is another stream."""
     waiting: int = 64
-    """Messages of a stream that wait for one that is missing, and references before any microphone: a second of 20 ms."""
+    """Most messages that wait behind a missing one, or references before any microphone: a good second of 20 ms."""
     waiting_bytes: int = 16_000_000
-    """Of all that waits: a gap of 10 s of eight microphones at 48 kHz, or a reference that is 83 s ahead of its microphone."""
+    """Most bytes that wait in all: a gap of 10 s of eight microphones at 48 kHz, or a reference 83 s ahead of its microphone."""
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
@@ -168,8 +168,8 @@ class _Order:
             yield from self._drain(True)
         if len(self._waiting) > self._most:
             raise SignalError(
-                f"{len(self._waiting)} messages wait for number {self._next} of their stream, expected {self._most} at"
-                " most: number each stream's messages 0, 1, 2, ..., and count its samples without gaps"
+                f"{len(self._waiting)} messages wait for number {self._next} of their stream, expected at most"
+                f" {self._most}: number each stream's messages 0, 1, 2, ..., and count its samples without gaps"
             )
 
     def _drain(self, lost: bool) -> Iterator[tuple[int, bytes, bool]]:
@@ -216,7 +216,7 @@ class TwoStreams:
         sound = self._mic.nbytes + self._ref.nbytes + sum(part.nbytes for _, part in self._early)
         if (waiting := sound + self._mic_order.bytes + self._ref_order.bytes) > self._limits.waiting_bytes:
             raise SignalError(
-                f"{waiting} bytes wait for messages that are missing, expected {self._limits.waiting_bytes} at most: number each"
+                f"{waiting} bytes wait for messages that are missing, expected at most {self._limits.waiting_bytes}: number each"
                 " stream's messages 0, 1, 2, ..., and do not send the reference ahead of the microphone"
             )
 

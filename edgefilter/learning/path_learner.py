@@ -38,12 +38,11 @@ class Schedule:
     first_s: float = 2.0
     """Seconds of audible robot until the first fit."""
     factor: float = 1.5
-    """From one wait to the next, which is at most MINUTE, or RECENT_S after another path was taken over: then there is something
-    to learn."""
+    """Factor by which the wait between two fits grows, up to MINUTE; it is RECENT_S again after another path was taken over."""
     fade: float = 0.9995
     """The robot is AUDIBLE where the reference's power is that near to its recent peak, which fades by this factor a hop."""
     times: int = 3
-    """As little as RECENT_S teaches more where it is replayed several times."""
+    """How often RECENT_S of sound, where there is no more, is replayed to a new path: once is too little to converge."""
     least: int = 8
     """Blocks of WITNESSES hops each, whose errors are compared as one, after which a candidate can win."""
     most: int = 60

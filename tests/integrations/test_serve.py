@@ -544,7 +544,7 @@ def references(size):
 
 ANNOUNCED = [json.dumps({"kind": "announce"}), pcm(np.full(500_000, 0.1))]
 HOARDS = {
-    "numbers that skip": ({"streams": "two"}, skipping(2, 20), "64 at most: number each stream's messages"),
+    "numbers that skip": ({"streams": "two"}, skipping(2, 20), "at most 64: number each stream's messages"),
     "large numbers that skip": ({"streams": "two"}, skipping(2, 3_900_000), "bytes wait for messages that are missing"),
     "references before any microphone": (
         {"streams": "two"},
