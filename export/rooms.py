@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import pyroomacoustics as pra
 
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -36,6 +35,8 @@ class Room:
 
 def draw_room(rng: np.random.Generator, kind: str) -> Room:
     """A shoebox room of that kind (Allen & Berkley 1979, by pyroomacoustics), robot and humans somewhere in it."""
+    import pyroomacoustics as pra  # here, so that RANGES can be had on a machine without it
+
     lengths, widths, decays, distances = RANGES[kind]
     size = np.array([rng.uniform(*lengths), rng.uniform(*widths), rng.uniform(2.4, 3.2)])
     rt60_s = max(rng.uniform(*decays), 1.05 * _shortest_decay(size))

@@ -87,6 +87,10 @@ class Trainer:
         items, held_out = (
             Items(folder, count, self._device()) for folder, count in ((data, newest), (validation, None))
         )
+        return self.train(items, held_out)
+
+    def train(self, items: Items, held_out: Items) -> Path:
+        """Train on these, wherever they come from."""
         batches = Batches(items, self.task.stft, self.shape, self.plan.seed, self.processes.rank)
         print(f"{self.task.describe(self.network)}; {len(items.names)} items, from step {self.step}", flush=True)
         steps = range(self.step, self.plan.steps)

@@ -14,7 +14,7 @@ LONGEST = (
     "diagnosis/test_probe.py",
     "learning/test_path_learner.py",
     "bench/test_evaluate.py",
-    "export/test_gpu_plan.py",
+    "export/test_gpu.py",
     "filter/test_hostile_inputs.py",
     "export/test_training.py",
     "diagnosis/test_diagnose.py",

@@ -38,7 +38,17 @@ def noise(
 
 
 def fan(rng: np.random.Generator, samples: int, rms: float) -> tuple[Samples, Samples]:
-    """Fan noise (n,) of that RMS and its PSD: falling, with bumps and a few blade lines."""
+    """Fan noise (n,) of that RMS and its PSD."""
+    taps = signal.firwin2(1023, np.linspace(0, 1, GRID_BINS), amplitude(rng))
+    white = rng.standard_normal(samples + taps.size - 1)
+    sound = signal.oaconvolve(white, taps, mode="valid")
+    scale = rms / math.sqrt(np.mean(sound**2))
+    response = np.abs(np.fft.rfft(taps, 2 * (GRID_BINS - 1)))[:GRID_BINS]
+    return (scale * sound).astype(np.float32), (2 / SAMPLE_RATE * (scale * response) ** 2).astype(np.float32)
+
+
+def amplitude(rng: np.random.Generator) -> Samples:
+    """Amplitude of a fan's spectrum on GRID_HZ, (601,): falling, with bumps and a few blade lines."""
     corner = 10 ** rng.uniform(math.log10(150), math.log10(4000))
     level_db = -10 * rng.uniform(0.6, 1.6) * np.log10(1 + (GRID_HZ / corner) ** 2)
     for centre in 10 ** rng.uniform(math.log10(60), math.log10(6000), size=5):
@@ -46,13 +56,7 @@ def fan(rng: np.random.Generator, samples: int, rms: float) -> tuple[Samples, Sa
     blade = rng.uniform(80, 400)
     for line in range(1, int(rng.integers(1, 5))):
         level_db += rng.uniform(0, 10) * np.exp(-0.5 * ((GRID_HZ - line * blade) / 12.0) ** 2)
-    amplitude = 10 ** (np.maximum(level_db, -45) / 20)
-    taps = signal.firwin2(1023, np.linspace(0, 1, GRID_BINS), amplitude)
-    white = rng.standard_normal(samples + taps.size - 1)
-    sound = signal.oaconvolve(white, taps, mode="valid")
-    scale = rms / math.sqrt(np.mean(sound**2))
-    response = np.abs(np.fft.rfft(taps, 2 * (GRID_BINS - 1)))[:GRID_BINS]
-    return (scale * sound).astype(np.float32), (2 / SAMPLE_RATE * (scale * response) ** 2).astype(np.float32)
+    return 10 ** (np.maximum(level_db, -45) / 20)
 
 
 def motors(rng: np.random.Generator, material: Material, played: Samples, rms: float) -> Samples:
