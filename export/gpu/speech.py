@@ -40,8 +40,11 @@ PEAK = 0.5
 
 
 def left(root: Path) -> int:
-    """Bytes that the files of the checkout leave of MOST_BYTES."""
-    listed = subprocess.run(["git", "ls-files", "-z"], cwd=root, capture_output=True, text=True, check=True).stdout
+    """Bytes that the files of the checkout leave of MOST_BYTES; raises UsageError where git knows of none."""
+    asked = subprocess.run(["git", "ls-files", "-z"], cwd=root, capture_output=True, text=True)
+    if asked.returncode:
+        raise UsageError(f"{root} is no checkout, so that nobody knows what it leaves: give --bytes")
+    listed = asked.stdout
     tracked = [root / name for name in listed.split("\0") if name]
     return MOST_BYTES - SPARE_BYTES - sum(path.stat().st_size for path in tracked if path.is_file())
 

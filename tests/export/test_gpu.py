@@ -145,9 +145,14 @@ def test_an_archive_keeps_to_its_bytes_and_takes_of_every_speaker(folders, archi
         speech.pack(kinds, [], small, 0)
 
 
-def test_the_checkout_leaves_room_for_speech():
-    """Half an hour of Opus at the least, or the plan is of no use."""
-    assert 5_000_000 < speech.left(ROOT) < speech.MOST_BYTES
+def test_the_files_of_a_checkout_leave_the_rest_to_speech(tmp_path):
+    with pytest.raises(UsageError, match="no checkout"):
+        speech.left(tmp_path)
+    (tmp_path / "tracked").write_bytes(bytes(1000))
+    (tmp_path / "other").write_bytes(bytes(2000))
+    for words in (["init", "-q"], ["add", "tracked"]):
+        subprocess.run(["git", *words], cwd=tmp_path, check=True)
+    assert speech.left(tmp_path) == speech.MOST_BYTES - speech.SPARE_BYTES - 1000
 
 
 @pytest.mark.slow
