@@ -2,7 +2,8 @@
 
     python -m bench count
 
-Named are names in capitals at the level of a module or a class whose value holds a number.
+Named are names in capitals at the level of a module or a class whose value holds a number, and the fields of a dataclass
+whose default does: a number that moves from the one to the other counts as before.
 """
 
 from __future__ import annotations
@@ -33,20 +34,24 @@ def run(options: argparse.Namespace) -> str:
     return "\n".join(lines)
 
 
-def named_numbers(body: Sequence[ast.stmt]) -> int:
-    """How many names in capitals statements give to a value that holds a number, those of classes in them too.
+def named_numbers(body: Sequence[ast.stmt], field: bool = False) -> int:
+    r"""How many names in capitals statements give to a value that holds a number, those of classes in them too.
+
+    field: whether the statements are a class's, in which annotated names count whatever their case.
 
     >>> named_numbers(ast.parse("A, B = 1, 2; C = 'one'; D: float = 0.5; e = 3").body)
     3
+    >>> named_numbers(ast.parse("class Settings:\n    wait_s: float = 0.5\n    name: str = 'one'").body)
+    1
     """
     count = 0
     for statement in body:
         if isinstance(statement, ast.ClassDef):
-            count += named_numbers(statement.body)
+            count += named_numbers(statement.body, True)
         elif isinstance(statement, (ast.Assign, ast.AnnAssign)) and statement.value and _holds_number(statement.value):
             targets = statement.targets if isinstance(statement, ast.Assign) else [statement.target]
             names = (node.id for target in targets for node in ast.walk(target) if isinstance(node, ast.Name))
-            count += sum(name.isupper() for name in names)
+            count += sum(name.isupper() or (field and isinstance(statement, ast.AnnAssign)) for name in names)
     return count
 
 
