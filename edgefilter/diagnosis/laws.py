@@ -128,21 +128,18 @@ def with_laws(
 
     A law beside all names has to be there by more than chance; one in place of the names of its family, which is known
     to be there, has to predict more than they do. It is preferred only where it explains much more. What the law makes
-    superfluous is dropped. None is looked for where next to nothing is left, and none beside names that leave as little as right ones do.
+    superfluous is dropped. None is looked for where the names leave as little as those of right ones do.
     """
     for _ in range(MOST):
         left = max(found.final.over_db - found.final.floor_db, 0.0)
-        if found.final.excess_db <= criteria.explained_db:
+        if found.final.excess_db <= (criteria.little_db if found.steps else criteria.explained_db):
             break
         names = {step.name for step in found.steps}
         if not (tried := list(_trials(found, progress, without))):
             break
         tried = [law for law in tried if law.gain_db >= criteria.part * left]
         instead = [law for law in tried if not names <= dict(law.model.effects).keys()]
-        little = (
-            bool(found.steps) and found.final.excess_db <= criteria.little_db
-        )  # the model of right names leaves as much
-        beside = [law for law in tried if law not in instead and law.p_value <= criteria.false_rate and not little]
+        beside = [law for law in tried if law not in instead and law.p_value <= criteria.false_rate]
         most = criteria.nearly * max((law.gain_db for law in (*instead, *beside)), default=0.0)
         choices = [law for law in beside if law.gain_db >= most] or [*instead, *beside]
         if not choices:
