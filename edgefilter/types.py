@@ -69,9 +69,7 @@ class Output(NamedTuple):
     unexplained: tuple[float, float] = (1.0, 1.0)
 
 
-_Speech: TypeAlias = Literal[
-    "speech_suspected", "speech_dismissed", "speech_started", "speech_stopped", "playback_gain"
-]
+_Speech: TypeAlias = Literal["speech_suspected", "speech_dismissed", "speech_started", "speech_stopped", "voice_gain"]
 _Filter: TypeAlias = Literal["realigned", "overloaded", "stepped_down", "stepped_up", "learned", "unlearned"]
 _SetUp: TypeAlias = Literal[
     "reference_missing",
@@ -109,7 +107,7 @@ class Event:
     kind : str
         What happened. "realigned": the reference was found elsewhere in the microphone. "speech_started",
         "speech_stopped": of the human, from engines that judge it; "speech_suspected", some hops before most beginnings,
-        which "speech_dismissed" takes back where nobody spoke; "playback_gain", with which gain (its detail) the robot
+        which "speech_dismissed" takes back where nobody spoke; "voice_gain", with which gain (its detail) the robot
         should speak until the next such event, so that what is heard tells whether it was the robot
         (`BargeInSettings.ask_db`). "overloaded", "stepped_down", "stepped_up": what too little or enough time led to.
         "learned", "unlearned": a better echo path was taken over, or given back.

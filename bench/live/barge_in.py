@@ -106,13 +106,13 @@ def listen(mic: Samples, ref: Samples, profile: Profile | None, engine: str, rob
         block = slice(at, min(at + ego.hop, mic.size))
         heard = mic[block]
         if robot:
-            fade.wanted = ego.playback_gain
+            fade.wanted = ego.voice_gain
             gains[block] = fade.apply(gains[block], SAMPLE_RATE)
             then = np.arange(block.start, block.stop) - robot.late
             heard = heard + (np.where(then < 0, 1.0, gains[then]) - 1.0).astype(np.float32) * robot.echo[block]
         done.append(ego.process(heard, gains[block] * ref[block]))
         probability.append(ego.speech_probability)
-    events = [event for event in ego.events() if event.kind.startswith(("speech", "playback"))]
+    events = [event for event in ego.events() if event.kind.startswith(("speech", "voice"))]
     return Output(np.concatenate((*done, ego.flush())), events, probability, ego.hop)
 
 
@@ -286,7 +286,7 @@ def real_minutes(folder: Path, engine: str) -> list[dict]:
 def stops(talk: Output, speech_s: float) -> dict:
     """How often the robot was stopped by itself, and how often it would have been at each of THRESHOLDS."""
     at_each = [starts(replay(talk.probability, talk.hop, at)) for at in THRESHOLDS]
-    asked = sum(event.kind == "playback_gain" and float(event.detail) < 1.0 for event in talk.events)
+    asked = sum(event.kind == "voice_gain" and float(event.detail) < 1.0 for event in talk.events)
     return {"speech_s": speech_s, "stops": starts(talk.events), "stops_at": at_each, "asked": asked}
 
 

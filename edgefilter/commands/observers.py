@@ -200,7 +200,7 @@ class Lowering:
             self._gain = LOWERED[self._how]
         elif self._how == "duck" and event.kind == "speech_stopped":
             self._gain = 1.0
-        self._speech.fade(min(self._gain, self._ego.playback_gain))
+        self._speech.fade(min(self._gain, self._ego.voice_gain))
 
 
 class Availability:

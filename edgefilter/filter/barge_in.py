@@ -44,7 +44,7 @@ class BargeInSettings:
     sentence, 0.2 s tells a recogniser sooner. judge: "engine", or "network" to let crnn's network judge beside an engine
     that judges no speech (`ss`, `linear`), at what crnn costs. ask_db: by how much the robot lowers its voice, dB, while
     somebody is suspected to speak; 0, never. What is heard with the lower voice then decides. It needs a player that
-    follows `EgoFilter.playback_gain`; 12 dB is what one person does when another begins to talk.
+    follows `EgoFilter.voice_gain`; 12 dB is what one person does when another begins to talk.
     Raises UsageError for probabilities outside 0 to 1, a release above the threshold, negative times or decibels, or another judge.
     """
 

@@ -56,7 +56,7 @@ class EgoFilter:
     on_suspicion : callable, optional
         Called in the same way with "speech_suspected", some 50 ms before a human's speech counts as begun, and with
         "speech_dismissed" where nobody spoke, 0.3 s later at most (`BargeInSettings.confirm_s`), or as long after a lower
-        voice is heard (`playback_gain`).
+        voice is heard (`voice_gain`).
     output : str
         Which of two sounds `process` returns; `other` gives the other one. "recognise": for a recogniser. "listen": for a
         call, a level meter or a detector of speech; up to 14 dB lower where the engine hears nobody speak, and the same
@@ -183,13 +183,13 @@ class EgoFilter:
         return self._stream.barge_in.speaking
 
     @property
-    def playback_gain(self) -> float:
+    def voice_gain(self) -> float:
         """Gain with which the robot should speak now: below 1 while somebody is suspected to speak (`BargeInSettings.ask_db`), else 1.
 
         Whoever plays fades to it within some 10 ms, and hands over as the reference what is played then. An event
-        "playback_gain" tells of each change.
+        "voice_gain" tells of each change.
         """
-        return self._stream.playback_gain
+        return self._stream.voice_gain
 
     @property
     def queued_s(self) -> float:

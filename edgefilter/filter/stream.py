@@ -243,7 +243,7 @@ class Stream:
         return self._synthesiser.push(output.spectrum, 1.0, listen)
 
     @property
-    def playback_gain(self) -> float:
+    def voice_gain(self) -> float:
         """As of `EgoFilter`."""
         return 10.0 ** (-self.barge_in.settings.ask_db / 20.0) if self.barge_in.asking else 1.0
 
@@ -255,7 +255,7 @@ class Stream:
 
     def _judge_speech(self, probability: float | None, frame: Frame, aligned: Aligned | None) -> None:
         self.speech_probability = probability
-        wait, gain = 0, self.playback_gain
+        wait, gain = 0, self.voice_gain
         if probability is not None:
             suspect = frame.at_any_lag or (self._watch is not None and self._watch.suspect)
             wait = self._watch.wait // self.engine.stft.hop if self._watch else 0
@@ -267,8 +267,8 @@ class Stream:
                     call(self.events[-1])
                 except BaseException as error:  # the rest of the block is filtered first
                     self._raised = self._raised or error
-        if self.playback_gain != gain:
-            self._tell("playback_gain", f"{self.playback_gain:.3f}")
+        if self.voice_gain != gain:
+            self._tell("voice_gain", f"{self.voice_gain:.3f}")
 
     def _tell(self, kind: EventKind, detail: str, turn: Turn | None = None, sound: Turn | None = None) -> None:
         self.events.append(Event(kind, self._stepped, detail, turn, sound))

@@ -150,9 +150,9 @@ class Duplex:
     def lowered(self, samples: Samples, rate: int) -> Samples:
         """Return what to hand to the loudspeaker, and to `play`: the samples (n,) or (n, channels), softer where the filter asks for it.
 
-        The filter asks while somebody is suspected to speak (`BargeInSettings.ask_db`, `EgoFilter.playback_gain`). rate: Hz.
+        The filter asks while somebody is suspected to speak (`BargeInSettings.ask_db`, `EgoFilter.voice_gain`). rate: Hz.
         """
-        self._asked.wanted = self.ego.playback_gain
+        self._asked.wanted = self.ego.voice_gain
         return self._asked.apply(samples, rate)
 
     def lowered_pcm16(self, pcm: bytes | memoryview, rate: int, channels: int = 1) -> bytes | memoryview:

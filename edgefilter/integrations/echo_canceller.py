@@ -138,9 +138,9 @@ class EchoCanceller:
         return self._filters[0].human_speaks
 
     @property
-    def playback_gain(self) -> float:
+    def voice_gain(self) -> float:
         """Gain with which the robot should speak now, as of `EgoFilter`, by the first microphone."""
-        return self._filters[0].playback_gain
+        return self._filters[0].voice_gain
 
     def events(self) -> list[Event]:
         """What happened at the first microphone since the last call, as of `EgoFilter`; its samples are those at 16 kHz."""

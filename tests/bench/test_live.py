@@ -325,7 +325,7 @@ def test_a_robot_that_asks_is_heard_lower_as_late_as_its_sound_comes(monkeypatch
             self.hops = 0
 
         @property
-        def playback_gain(self) -> float:
+        def voice_gain(self) -> float:
             return 0.25 if 10 <= self.hops < 20 else 1.0
 
         def process(self, mic: np.ndarray, ref: np.ndarray) -> np.ndarray:

@@ -19,7 +19,7 @@ from edgefilter.session import Progress
 from edgefilter.types import Event
 from tests.program import argv
 
-GAIN = Event("playback_gain", 24000, "0.250")
+GAIN = Event("voice_gain", 24000, "0.250")
 STARTED, STOPPED = (Event(f"speech_{word}", 24000, "probability 0.98") for word in ("started", "stopped"))
 
 
@@ -82,7 +82,7 @@ def test_the_robot_is_lowered_while_the_filter_asks_for_it_and_stopped_for_good_
     speech.fade = speech.gains.append
     lowering = Lowering(speech, ego, how)
     for event, gain in ((GAIN, 0.25), (STARTED, 1.0), (GAIN, 1.0), (STOPPED, 1.0)):
-        ego.playback_gain = gain
+        ego.voice_gain = gain
         lowering.hear(event)
     assert speech.gains == pytest.approx(gains)
 

@@ -227,14 +227,14 @@ def test_a_robot_that_asks_tells_its_own_voice_from_a_human_by_lowering_it(human
     stream = Stream(Loud(), barge_in=BargeInSettings(ask_db=12.0))
     gains = np.ones(ref.size + hop, np.float32)
     for at in range(0, ref.size - hop, hop):
-        gains[at : at + hop] = stream.playback_gain
+        gains[at : at + hop] = stream.voice_gain
         heard = mic[at : at + hop] * gains[np.maximum(np.arange(at, at + hop) - lag, 0)]
         stream.process(mic[at : at + hop] if human else heard, ref[at : at + hop] * gains[at : at + hop])
-    kinds = [event.kind for event in stream.events if event.kind.startswith(("speech", "playback"))]
+    kinds = [event.kind for event in stream.events if event.kind.startswith(("speech", "voice"))]
     first = kinds.index("speech_suspected")
-    assert kinds[first : first + 2] == ["speech_suspected", "playback_gain"]
+    assert kinds[first : first + 2] == ["speech_suspected", "voice_gain"]
     assert right in kinds and (human or "speech_started" not in kinds)
-    lowered = [event.detail for event in stream.events if event.kind == "playback_gain"]
+    lowered = [event.detail for event in stream.events if event.kind == "voice_gain"]
     assert lowered[:2] == ["0.251", "1.000"]
 
 

@@ -129,7 +129,7 @@ def test_speech_cut_off_in_mid_word_was_not_played_and_the_next_begins_at_once(w
 def test_speech_is_lowered_while_the_filter_asks_for_it_and_the_filter_knows_what_waits(witness, channels):
     duplex, said = Duplex(witness), np.full(1600, 0.4, np.float32)
     for gain, last in ((1.0, 0.4), (0.25, 0.1), (1.0, 0.4)):
-        witness.playback_gain = gain
+        witness.voice_gain = gain
         pcm = duplex.lowered_pcm16(as_pcm16(said, channels), RATE, channels)
         sound = from_pcm16(pcm, channels)
         assert sound[-1] == pytest.approx(last, abs=1e-4) and np.abs(np.diff(sound)).max() < 0.01

@@ -62,7 +62,7 @@ def test_the_loudspeaker_s_sound_is_left_alone_and_noted_at_its_rate(filters):
 
 
 def test_the_loudspeaker_s_sound_is_lowered_where_the_filter_asks_for_it_and_so_is_the_reference(filters, monkeypatch):
-    monkeypatch.setattr(EgoFilter, "playback_gain", 0.25)
+    monkeypatch.setattr(EgoFilter, "voice_gain", 0.25)
 
     async def speak():
         await filters.params["audio_out_filter"].start(16_000)

@@ -162,7 +162,7 @@ def test_a_client_whose_player_lowers_its_voice_is_told_the_gain(conversation):
     ref[7 * RATE :] = np.roll(ref[7 * RATE :], 3200)  # its lag of 350 ms is too long to hear the lower voice in time
     for ask_db, gains in ((0, []), (12, ["0.251", "1.000"])):
         _, told = run(heard({"ask_db": ask_db}, stereo_messages(mic, ref)))
-        assert [each["detail"] for each in told if each["kind"] == "playback_gain"][:2] == gains
+        assert [each["detail"] for each in told if each["kind"] == "voice_gain"][:2] == gains
         assert "speech_started" in kinds(told)
 
 
