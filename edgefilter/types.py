@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, TypeAlias, TypedDict, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edgefilter.errors import SignalError
+from edgefilter.errors import SignalError, UsageError
 
 SAMPLE_RATE = 16000
 """Samples per second of everything inside; sources convert at the door."""
@@ -234,6 +235,13 @@ class Stats(TypedDict):
     array: ArrayStats | None
     learning: dict[str, object] | None
     deadline: DeadlineStats | None
+
+
+def expect_positive(fields: Mapping[str, object]) -> None:
+    """Raise UsageError for the first of these fields, by name, whose number, or one of whose numbers, is not above 0."""
+    for name, value in fields.items():
+        if not np.min(np.asarray(value)) > 0:
+            raise UsageError(f"{name} is {value}, expected more than 0")
 
 
 def as_samples(x: object, name: str) -> Samples:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import asdict, dataclass
 
-from edgefilter.errors import UsageError
+from edgefilter.types import expect_positive
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,7 @@ class Lateness:
     """Largest difference of two clocks: by so much a delay may grow without a loss."""
 
     def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
-            if not (value > 0 or (name == "look_s" and value == 0)):
-                raise UsageError(f"{name} is {value}, expected more than 0")
+        expect_positive({name: value for name, value in asdict(self).items() if name != "look_s" or value != 0})
 
 
 class SampleClock:

@@ -21,10 +21,10 @@ from edgefilter.echo.measurement import whiten
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.recording import BLOCK, fitted_blocks, paired
 from edgefilter.echo.wiener import convolve_from, fit_filter
-from edgefilter.errors import SignalError, UsageError
+from edgefilter.errors import SignalError
 from edgefilter.profile.approximation import CLEARLY_DB
 from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, GRID_HZ, PROVISIONAL, Profile
-from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples, expect_positive
 
 TAIL_S = 0.3
 
@@ -55,9 +55,7 @@ class PathFit:
     """Of silence: with fewer the quietest frames stand in for it."""
 
     def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
-            if not np.min(value) > 0:
-                raise UsageError(f"{name} is {value}, expected more than 0")
+        expect_positive(asdict(self))
 
 
 FIT = PathFit()

@@ -10,8 +10,8 @@ from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from edgefilter.errors import SignalError, UsageError
-from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, Samples, SoundFor
+from edgefilter.errors import SignalError
+from edgefilter.types import MOST_MICROPHONES, SAMPLE_RATE, Samples, SoundFor, expect_positive
 
 HEADER = struct.Struct("<BxHQ")
 """Before the sound of a message of one of two streams: its label, 0 for the microphone and 1 for the reference, an unused
@@ -65,9 +65,7 @@ class Limits:
     """Most bytes that wait in all: a gap of 10 s of eight microphones at 48 kHz, or a reference 83 s ahead of its microphone."""
 
     def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
-            if not value > 0:
-                raise UsageError(f"{name} is {value}, expected more than 0")
+        expect_positive(asdict(self))
 
 
 @dataclass(frozen=True)

@@ -19,14 +19,14 @@ from edgefilter.echo.effect import vanishes
 from edgefilter.echo.effects.catalogue import EFFECTS, find
 from edgefilter.echo.measurement import Measurement, whiten
 from edgefilter.echo.model import EchoModel
-from edgefilter.errors import ProfileError, UsageError
+from edgefilter.errors import ProfileError
 from edgefilter.filter.canceller import COLD, Canceller
 from edgefilter.filter.echo_path import PAST, TAPS, EchoPath, Effects, FilteredHop, PathState, PathUpdate, starting_path
 from edgefilter.filter.volume import AUDIBLE, WITNESSES
 from edgefilter.learning.history import MINUTE, RECENT_S, HopHistory, emphasised
 from edgefilter.profile.array import ArrayCalibration
 from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, LEARNED, Profile
-from edgefilter.types import SAMPLE_RATE, EventKind, Samples
+from edgefilter.types import SAMPLE_RATE, EventKind, Samples, expect_positive
 
 BEFORE = "the path of before"
 
@@ -53,9 +53,7 @@ class Schedule:
     """How many of its standard errors that must be: a human adds the same error to both."""
 
     def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
-            if not value > 0:
-                raise UsageError(f"{name} is {value}, expected more than 0")
+        expect_positive(asdict(self))
 
 
 SCHEDULE = Schedule()

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from edgefilter.diagnosis.passport import Passport
-from edgefilter.errors import UsageError
 from edgefilter.report.text import sentence
+from edgefilter.types import expect_positive
 
 ERROR_DB = 2.3, 8.4
 """Of the predicted SI-SDR, median and worst of 34 humans on 7 real devices, three engines: bench/results/passport.md."""
@@ -26,9 +26,7 @@ class SetUp:
     """Where a fixed filter can remove so much more than the running one did, calibrating or learning pays."""
 
     def __post_init__(self) -> None:
-        for name in ("drift_ppm", "lag_spread_ms", "unlearned_db"):
-            if not getattr(self, name) > 0:
-                raise UsageError(f"{name} is {getattr(self, name)}, expected more than 0")
+        expect_positive({name: getattr(self, name) for name in ("drift_ppm", "lag_spread_ms", "unlearned_db")})
 
 
 SET_UP = SetUp()
