@@ -334,6 +334,7 @@ def _ros2(commands: argparse._SubParsersAction) -> None:
     option("--profile", metavar="P.npz", help="calibrated robot")
     option("--engine", **ENGINE)
     option("--confirm-s", **CONFIRM)
+    option("--ask-db", **ASK)
     told = "domain of DDS (default: ROS_DOMAIN_ID, or 0)"
     option("--domain", type=whole(0, 232, "a domain, 0 to 232"), metavar="N", help=told)
     _form(option)

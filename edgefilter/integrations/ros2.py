@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from cyclonedds.core import DDSException, Policy, Qos
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.idl import IdlStruct
-from cyclonedds.idl.types import int32, sequence, uint8, uint32
+from cyclonedds.idl.types import float32, int32, sequence, uint8, uint32
 from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
@@ -46,6 +46,13 @@ class Bool(IdlStruct, typename="std_msgs::msg::dds_::Bool_"):  # type: ignore[ca
     """std_msgs/Bool."""
 
     data: bool
+
+
+@dataclass
+class Float32(IdlStruct, typename="std_msgs::msg::dds_::Float32_"):  # type: ignore[call-arg]
+    """std_msgs/Float32."""
+
+    data: float32
 
 
 @dataclass
@@ -112,7 +119,7 @@ class Topics:
 
 
 class Node:
-    """The filter between topics: /human, /barge_in and /diagnostics out. domain: of DDS, ROS_DOMAIN_ID."""
+    """The filter between topics: /human, /barge_in, /voice_gain and /diagnostics out. domain: of DDS, ROS_DOMAIN_ID."""
 
     def __init__(self, ego: EgoFilter, topics: Topics, domain: int) -> None:
         self._topics = topics
@@ -138,6 +145,7 @@ class Node:
         self._silenced = DataReader(participant, topic(topics.silenced, Empty), qos=hears)
         self._human = DataWriter(participant, topic(topics.human, AudioData), qos=says)
         self._barge_in = DataWriter(participant, topic("/barge_in", Bool), qos=says)
+        self._voice_gain = DataWriter(participant, topic("/voice_gain", Float32), qos=says)
         self._diagnostics = DataWriter(participant, topic("/diagnostics", DiagnosticArray), qos=says)
 
     def stop(self) -> None:
@@ -188,6 +196,8 @@ class Node:
     def _tell(self, event: Event) -> None:
         if event.kind in ("speech_started", "speech_stopped"):
             self._barge_in.write(Bool(data=event.kind == "speech_started"))
+        elif event.kind == "voice_gain":
+            self._voice_gain.write(Float32(data=float(event.detail)))
         elif event.kind in SET_UP_WRONG:
             self._wrong[event.kind] = event.detail
 

@@ -43,6 +43,8 @@ def _options(words: list[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--mic-channels", type=Channels.parse, help=told)
     told = "longest time from the suspicion that the human speaks to certainty, s"
     parser.add_argument("--confirm-s", type=float, default=BargeInSettings.confirm_s, help=told)
+    told = "what the program lowers the voice by while the human may have begun to speak, to hear who it was, dB"
+    parser.add_argument("--ask-db", type=float, default=BargeInSettings.ask_db, help=told)
     return vars(parser.parse_args(words))
 
 
@@ -55,7 +57,7 @@ class HumanConf(SICConfMessage):
 
     profile: file of the calibrated robot, where the component runs. engine: as of `EgoFilter`. channels: of the
     microphone's sound, interleaved, of which a message does not tell how many it has. mic_channels: as of `Duplex`.
-    confirm_s: as of `BargeInSettings`.
+    confirm_s, ask_db: as of `BargeInSettings`.
     """
 
     profile: str | None = None
@@ -63,6 +65,7 @@ class HumanConf(SICConfMessage):
     channels: int | None = None
     mic_channels: Sequence[int] | None = None
     confirm_s: float | None = None
+    ask_db: float | None = None
 
 
 def _ears(
@@ -71,21 +74,23 @@ def _ears(
     channels: int,
     mic_channels: Sequence[int] | Channels | None,
     confirm_s: float,
+    ask_db: float,
     on_event: Callable[[Event], None] | None = None,
 ) -> tuple[Duplex, int]:
     """The filter for a microphone of so many channels, and their number; raises EdgefilterError where it cannot be made."""
     if channels < 1:
         raise UsageError(f"channels is {channels}, expected at least 1")
     array = Channels.named(mic_channels, there=channels)
-    ego = EgoFilter(profile, engine=engine, barge_in=BargeInSettings(judge="network", confirm_s=confirm_s))
+    settings = BargeInSettings(judge="network", confirm_s=confirm_s, ask_db=ask_db)
+    ego = EgoFilter(profile, engine=engine, barge_in=settings)
     return Duplex(ego, on_event=on_event, mic_channels=array), channels
 
 
 class SpeechMessage(SICMessage):
-    """The human began or stopped speaking, or something was connected wrongly.
+    """The human began or stopped speaking, the robot should lower its voice, or something was connected wrongly.
 
-    kind, detail: of the `edgefilter.Event`. seconds: of the microphone. is_speaking: whether the human speaks now; None for
-    events of other kinds.
+    kind, detail: of the `edgefilter.Event`; the detail of "voice_gain" is the gain. seconds: of the microphone. is_speaking:
+    whether the human speaks now; None for events of other kinds.
     """
 
     def __init__(self, event: Event) -> None:

@@ -13,7 +13,7 @@ import soundfile
 from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.idl import IdlStruct
-from cyclonedds.idl.types import int32, sequence, uint8, uint32
+from cyclonedds.idl.types import float32, int32, sequence, uint8, uint32
 from cyclonedds.internal import InvalidSample
 from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
@@ -42,6 +42,11 @@ class Audio(IdlStruct, typename="audio_common_msgs::msg::dds_::AudioData_"):
 @dataclass
 class Flag(IdlStruct, typename="std_msgs::msg::dds_::Bool_"):
     data: bool
+
+
+@dataclass
+class Number(IdlStruct, typename="std_msgs::msg::dds_::Float32_"):
+    data: float32
 
 
 @dataclass
@@ -93,6 +98,7 @@ class Robot:
         self.speech = DataWriter(self.participant, Topic(self.participant, "rt/speech", Audio), qos=reliable)
         self.human = DataReader(self.participant, Topic(self.participant, "rt/human", Audio), qos=reliable)
         self.barge_in = DataReader(self.participant, Topic(self.participant, "rt/barge_in", Flag), qos=reliable)
+        self.gains = DataReader(self.participant, Topic(self.participant, "rt/voice_gain", Number), qos=reliable)
         self.reports = DataReader(self.participant, Topic(self.participant, "rt/diagnostics", Statuses), qos=reliable)
 
     def wait_for_node(self):
@@ -103,16 +109,20 @@ class Robot:
             assert time.monotonic() < end, "the node was not found"
             time.sleep(0.1)
 
-    def converse(self, room_of, seconds=6.0, human_at=3.0):
-        """The robot talks, the human begins beside it; what the node sent, and when it told of the human."""
+    def converse(self, room_of, seconds=6.0, human_at=3.0, paced=False):
+        """The robot talks, as it is played or all at once, the human begins beside it; what the node sent, and when it told of the human."""
         room, sound, told = room_of.Room(), [], []
         said = np.rint(room_of.ROBOT * 32767).astype("<i2").tobytes()
-        for at in range(0, len(said), 64_000):
-            self.speech.write(Audio(data=list(said[at : at + 64_000])))
+        size = 2 * FRAME if paced else 64_000
+        pieces = [Audio(data=list(said[at : at + size])) for at in range(0, len(said), size)]
+        while pieces and not paced:
+            self.speech.write(pieces.pop(0))
         room.play(room_of.ROBOT)
         time.sleep(0.3)
         began = time.monotonic()
         for step in range(round(seconds * RATE / FRAME)):
+            if pieces:
+                self.speech.write(pieces.pop(0))
             if step == round(human_at * RATE / FRAME):
                 room.speak()
             heard = np.rint(room.hear(FRAME) * 32767).astype("<i2").tobytes()
@@ -139,17 +149,19 @@ def node(domain, folder, *more, profile=PROFILE):
 @pytest.mark.slow
 def test_the_node_gives_the_human_and_barge_in_also_after_it_was_killed_and_started_again(tmp_path, room_of):
     robot = Robot(domain=87)
-    for number in (signal.SIGKILL, signal.SIGTERM):
-        process = node(87, tmp_path)
+    for number, asks in ((signal.SIGKILL, False), (signal.SIGTERM, True)):
+        process = node(87, tmp_path, *(("--ask-db", 12) if asks else ()))
         try:
             robot.wait_for_node()
-            sound, told = robot.converse(room_of)
+            sound, told = robot.converse(room_of, paced=asks)
+            gains = [round(message.data, 2) for message in received(robot.gains)]
             reports = [message.status[0] for message in received(robot.reports)]
         finally:
             process.send_signal(number)
             assert process.wait(20) == (0 if number == signal.SIGTERM else -number)
         assert sound.size > 5.5 * RATE
         assert told and told[0][1] and 3.0 < told[0][0] < 4.0, told
+        assert gains[:2] == ([0.25, 1.0] if asks else []), gains  # what waits at the loudspeaker cannot be lowered
         both = slice(3 * RATE, round(5.4 * RATE))
         assert si_sdr(sound[both], room_of.HUMAN[: both.stop - both.start]) > 3  # before: -23 dB
         assert reports[-1].name == "edgefilter" and reports[-1].level == 0
