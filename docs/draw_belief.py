@@ -16,7 +16,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import soundfile
 
-from edgefilter.alignment.aligner import LATE, Aligner
+from edgefilter.alignment.aligner import LATEST, Aligner
 from edgefilter.alignment.lag_search import STEEP
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -32,18 +32,19 @@ class Watched(Aligner):
 
     def believe(self) -> np.ndarray:
         """Probability by row of lags, (rows,): of the delay while it is known, otherwise of what the last search saw."""
-        rows = np.zeros((self._max_lag + LATE) // CELL + 1)
+        rows = np.zeros((self._max_lag + LATEST) // CELL + 1)
         if self._known and not self._refuted:
-            rows[int(self._drift.delay + LATE) // CELL] = self._probability
+            rows[int(self._drift.delay + LATEST) // CELL] = self._probability
         elif self._open and self.seen is not None:
             np.maximum.at(rows, np.arange(self.seen.size) // CELL, self.seen)
         return rows
 
     def _search(self) -> bool:
-        looked = self._stage == 2 and self._lags._crosses
+        before = vars(self._lags).get("_crosses")
         switched = super()._search()
-        if looked:
-            score = self._lags._scored(self._lags._crosses[0])
+        crosses = vars(self._lags).get("_crosses")
+        if crosses and crosses is not before:
+            score = self._lags._scored(crosses[0])
             best = self._lags._best(score)
             odds = (best.odds if best else 0.0) * (np.maximum(score, 0.0) / score.max()) ** STEEP
             self.seen = odds / (1.0 + odds.sum())
@@ -57,7 +58,7 @@ def believed(mic: Samples, ref: Samples) -> tuple[np.ndarray, float]:
         aligner.step(mic[at : at + HOP], ref[at : at + HOP])
         columns.append(aligner.believe())
     whole = np.array(columns[: len(columns) // COLUMN * COLUMN])
-    return whole.reshape(-1, COLUMN, whole.shape[1]).max(axis=1).T, -LATE / SAMPLE_RATE
+    return whole.reshape(-1, COLUMN, whole.shape[1]).max(axis=1).T, -LATEST / SAMPLE_RATE
 
 
 def draw(paths: list[str]) -> None:

@@ -142,7 +142,7 @@ SoundFor: TypeAlias = Literal["recognise", "listen"]
 """For whom the human's sound is: a recogniser, or somebody in a call, a level meter, a detector of speech."""
 
 AlignmentState: TypeAlias = Literal["idle", "announced", "begun", "unfound", "coarse", "lost", "locked"]
-"""What is known of the utterance that may be heard now (edgefilter.alignment.delay_line.Aligned)."""
+"""What is known of the utterance that may be heard now (edgefilter.alignment.aligner.Aligned)."""
 
 
 class AlignmentCounts(TypedDict, total=False):

@@ -4,30 +4,32 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
+from edgefilter.alignment.belief import Belief, believed
 from edgefilter.alignment.coarse_lag import CoarseLag
-from edgefilter.alignment.delay_line import (
-    HALF_WIDTH,
-    WAIT,
-    Aligned,
-    DelayBuffer,
-    kernel_table,
-    read_delayed,
-    read_line,
-)
+from edgefilter.alignment.delay_line import HALF_WIDTH, WAIT, DelayBuffer, kernel_table, read_delayed, read_line
 from edgefilter.alignment.delay_tracker import DRIFTED, FAINT, SIZE, STRIDE, DelayMeasurement, DelayMeter, DriftFilter
-from edgefilter.alignment.lag_search import ALIKE, CERTAIN, MINIMUM, MOST_LAG_S, REFLECTIONS, Found, LagSearch
+from edgefilter.alignment.lag_search import ALIKE, CERTAIN, EVEN, MINIMUM, MOST_LAG_S, REFLECTIONS, Found, LagSearch
 from edgefilter.alignment.utterances import AHEAD, Announcements, FirstSounds, OnsetDetector, Playback, Utterance
 from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, AlignmentCounts, AlignmentState, AlignmentStats, Samples
 
+UNLOCATED: tuple[AlignmentState, ...] = ("begun", "announced")
+"""States of the alignment in which the reference may lie elsewhere than the microphone hears it."""
 LIKELY_LAG_S = 2.0
 """Lag of the playback up to which an utterance is waited for: one that is heard later is rarer than a loudspeaker that is muted."""
 LATE = SAMPLE_RATE // 10
-"""Samples by which a reference may come after its echo and is still found, to be told of."""
+"""Samples by which a reference may come after its echo and is still found for an utterance; with LATEST they are found .15 s later."""
+LATEST = SAMPLE_RATE
+"""The same for a look that supposes nothing. It hears twice as many at most, so that half is left then."""
+LOOKS, FIRST_LOOK = 12, SAMPLE_RATE // 2
+"""Looks that are remembered, and samples of an utterance after which there is one: then one every LATEST, and one at each realignment.
+Speech that begins while the reference is silent waits for as long until it is nobody's but a human's: the reference may follow."""
 SEARCH_STRIDE = 768
 """Samples between two searches of the whole range."""
 COARSE_MARGIN = 400
@@ -40,6 +42,43 @@ LOST_BLOCKS, NEARBY_SEARCHES = 3, 10
 """Measurements in speech without a credible peak after which all lags are searched again, so often as if the present delay
 had ceased SIZE samples ago, which finds jumps of up to 200 ms, then as if the utterance had begun half a second before. A delay
 that no measurement has ever seen is doubted once it is more likely wrong than right, from the beginning of the utterance on."""
+
+
+class Past(NamedTuple):
+    """The last seconds of both channels, and the utterances in the reference."""
+
+    mic: DelayBuffer
+    ref: DelayBuffer
+    onsets: OnsetDetector
+
+
+class Aligned(NamedTuple):
+    """The reference as an aligner delivers it for one hop of the microphone.
+
+    reference: (hop,) float32, delayed so that the robot's direct sound lies PRE_ROLL samples behind it; zeros while no
+    delay is known. delay: samples, of the direct sound at the end of the hop, nan if unknown. ppm: by how much it shrinks,
+    1e-6 samples per sample. confidence: probability that the delay is right, 0 to 1. realigned: the delay was switched
+    discontinuously in this hop. state: of the utterance that may be heard now. "idle": nothing of the reference can be
+    audible. "announced": it is waited for, and may begin at any time or never. "begun": it has begun and is not found yet;
+    delay is the one of before, or nan. "unfound": as "begun", but it should have been heard by now, whatever its lag.
+    "coarse": no sharp arrival was found yet, the delay is known to within 25 ms; the reference is early by as much. "lost":
+    it was found, but the last looks did not see it, beside a loud human or after a jump; delay is carried on, with its
+    drift. "locked": its delay is followed. at_any_lag: what is heard may be an utterance at a lag that nobody knows: it was
+    not found so far, and no delay is known, or the one of before was refuted; of a calibrated robot, it is too loud for
+    anybody else (FirstSounds). wait: samples by which the microphone must be delayed to fit the reference, WAIT at most.
+    past: what was heard so far. belief: what the latest looks say together, in a hop in which one was taken.
+    """
+
+    reference: Samples
+    delay: float
+    ppm: float
+    confidence: float
+    state: AlignmentState
+    realigned: bool
+    at_any_lag: bool = False
+    wait: int = 0
+    past: Past = Past(DelayBuffer(WAIT), DelayBuffer(WAIT), OnsetDetector(WAIT))
+    belief: Belief | None = None
 
 
 class Aligner:
@@ -73,8 +112,8 @@ class Aligner:
     def _listen_for(self, responses: Sequence[Samples] | None) -> None:
         """What an arrival looks like from now on: the microphones' impulse responses (taps,); None: anything."""
         self._responses = responses
-        early = None if responses is None else [one[: PRE_ROLL + REFLECTIONS] for one in responses]
-        self._lags = LagSearch(self._max_lag, early, LATE)
+        early = [one[: PRE_ROLL + REFLECTIONS] for one in responses or ()]
+        self._lags = LagSearch(self._max_lag, early, LATE, (LATEST, 2 * LATEST))
         self._meter = DelayMeter(None if responses is None else responses[self._used[0]])
 
     def reset(self) -> None:
@@ -90,9 +129,13 @@ class Aligner:
         self._open: deque[Utterance] = deque(maxlen=32)
         self._announced = Announcements()
         self._expected: Playback | None = None
-        self._found: Found | None = None
+        self._steps: Iterator[bool] = iter(())  # of the search that is under way
+        self._looks: deque[Found] = deque(maxlen=LOOKS)
+        self._seen: Found | None = None  # by a look that is no part of the belief yet
+        self._next_look = self._looked = 0
+        self._belief = believed(self._looks)
         self._read_at, self._wait = float("nan"), 0
-        self._to_search, self._to_measure, self._stage, self._far = SEARCH_STRIDE, STRIDE // 2, 0, False
+        self._to_search, self._to_measure = SEARCH_STRIDE, STRIDE // 2
         self._gain: float | None = None
         self._by_bands = None if self._calibrated else CoarseLag(self.hop, self._max_lag)
         self._coarse = False  # whether a lag is followed at which nothing sharp arrives
@@ -133,20 +176,40 @@ class Aligner:
         if started:
             self._open.append(started)
             self._counts["utterances"] += 1
+            self._next_look = self._ref.end + FIRST_LOOK
             if self._expected is not None:
-                self._stage, self._to_search, self._expected = 0, 0, None
+                self._steps, self._to_search, self._expected = iter(()), 0, None
         if self._open:
             self._expire()
-        before = self._read_at
-        self._measured = False
-        switched = False
+        before, switched, self._measured = self._read_at, False, False
         if self._known or self._coarse:
             self._drift.advance(self.hop)
             switched = self._measure()
         if self._by_bands and not self._known:
             switched = self._look_coarsely(mic, ref, self._by_bands) or switched
         switched = self._search() or switched
-        return self._deliver(mic, before, switched)
+        aligned = self._deliver(mic, before, switched)
+        past = Past(self._mics[self._used[0]], self._ref, self._onsets)
+        return aligned._replace(past=past, belief=self._believe(aligned))
+
+    def _believe(self, aligned: Aligned) -> Belief | None:
+        """What is believed where a look has seen something, or a lag is followed and it is time for a look."""
+        seen, self._seen, now = self._seen, None, self._ref.end
+        if self._follows(aligned.state):
+            if not aligned.realigned and now < self._next_look:
+                return None
+            sure = CERTAIN / (CERTAIN + 1.0) if aligned.state == "coarse" else aligned.confidence
+            seen, self._next_look = Found.followed(round(aligned.delay), sure, now), now + LATEST
+        if seen is None:
+            return None
+        # where a robot says something again, so does chance: what is more likely wrong than right is not believed if it agrees
+        self._looks.append(seen if seen.clearness > EVEN else replace(seen, clearness=0.0))
+        self._belief = believed(self._looks)
+        return self._belief
+
+    def _follows(self, state: AlignmentState) -> bool:
+        """Whether the lag that is followed counts as a look: not one that was found while the reference was late."""
+        return state in ("locked", "coarse") and not (self._belief.late[-1:] > 0.5).any()
 
     def _look_coarsely(self, mic: Samples, ref: Samples, by_bands: CoarseLag) -> bool:
         """Find where the reference is to be read as long as nothing sharper is known; True if that is elsewhere than before."""
@@ -200,7 +263,7 @@ class Aligner:
 
     def _audible(self) -> bool:
         """Whether something of the reference can still be heard."""
-        reach = self._max_lag if not self._known else int(self._drift.delay) + SAMPLE_RATE // 4
+        reach = self._max_lag if not self._known else max(int(self._drift.delay), 0) + SAMPLE_RATE // 4
         return self._onsets.current.end + reach >= self._ref.end
 
     def _expire(self) -> None:
@@ -209,7 +272,7 @@ class Aligner:
         if self._ref.end > end + self._likely:
             self._missed = True
             if not self._known and self._responses is not None:  # it may stand elsewhere than where it was calibrated
-                self._stage = 0
+                self._steps = iter(())
                 self._listen_for(None)
         if self._ref.end > end + self._latest:
             self._resolve(found=False)
@@ -218,55 +281,76 @@ class Aligner:
     def _resolve(self, found: bool = True) -> None:
         self._open.popleft()
         self._trusted = found
-        self._stage = 0
+        self._steps = iter(())
         self._refuted = self._missed = False
 
     def _search(self) -> bool:
-        """Look for the oldest unresolved utterance, or an announced one, a step each hop; True if the delay was switched."""
+        """A step of a search over all lags each hop, to be looked at by itself or for an utterance; True if the delay was switched."""
         self._to_search -= self.hop
-        if self._measured or (self._stage == 0 and self._to_search > 0):
+        if self._measured:
             return False
-        now, stage, self._stage = self._ref.end, self._stage, 0
-        if stage == 0:
-            self._expected = None if self._open else self._announced.expected(now)
-            too_soon = self._open and now + 2 * self.hop - self._open[0].start < MINIMUM and not self._open[0].nearby
-            if too_soon or (not self._open and self._expected is None):
+        switched = next(self._steps, None)
+        if switched is None:
+            now = self._ref.end
+            # it sounds, or did when a look was due while another was under way
+            sounds = now - self._onsets.current.end <= SEARCH_STRIDE
+            due = sounds and now >= self._next_look and not self._follows(self._state())
+            if due:
+                self._next_look += LATEST
+            elif self._to_search > 0:
                 return False
-            self._to_search, self._stage = SEARCH_STRIDE, 1
-            self._counts["searches"] += 1
-            if self._open and self._open[0].nearby > 0:
-                self._open[0].nearby -= 1
-                before = SIZE if self._open[0].nearby else SAMPLE_RATE // 2
-                self._open[0].start = now - int(self._drift.delay) - before
-            since = self._expected.start if self._expected else self._open[0].start
-            self._lags.prepare(self._expected or self._ref, now, since)
-        elif stage == 1:
-            self._stage = 2
-            heard_out = self._open[0].after + int(self._drift.delay) if self._open and self._trusted else 0
-            together = self._used if self._responses is not None else self._used[:1]
-            self._lags.listen({at: self._mics[at] for at in together}, now, heard_out)
-        elif stage == 2:
-            found = self._lags.find()
-            return found is not None and self._weigh(found, looked_back=False)
-        elif found := self._found:
-            first, ref = self._used[0], self._expected or self._ref
-            return self._weigh(self._lags.before(first, self._mics[first], ref, found), looked_back=True)
-        return False
+            self._steps = self._look_anywhere() if due else self._look_for_utterance()
+            switched = next(self._steps, None)
+        return bool(switched)
 
-    def _weigh(self, found: Found, looked_back: bool) -> bool:
-        """Believe a lag, give it up, or look back at what was heard before, if anything was; True if the delay was switched.
+    def _look_anywhere(self) -> Iterator[bool]:
+        """Look at the latest sound and suppose nothing of it; a step at a time."""
+        self._lags.prepare(self._ref, self._ref.end)
+        yield False
+        self._lags.listen({0: self._mics[self._used[0]]}, self._ref.end, self._looked)
+        yield False
+        # a silent microphone does not show the robot either
+        self._seen = self._lags.find() or Found(0, 0.0, self._ref.end)
+        self._looked = self._ref.end + min(self._seen.lag, 0)  # at that lag the next look hears what this one did not
+        sure = self._seen.lag >= -WAIT and self._seen.odds > CERTAIN
+        yield sure and bool(self._open) and not self._known and self._take(self._seen)
 
-        A sequential test (Wald 1945): each window that is looked back at changes the odds, until they are certain or too low.
+    def _look_for_utterance(self) -> Iterator[bool]:
+        """Look for the oldest unresolved utterance, or an announced one, a step at a time, each with whether the delay was switched.
+
+        A sequential test (Wald 1945): each window of what was heard before changes the odds, until they are certain or too low.
         """
-        # a reference that comes after its echo is rare: two windows must show it
-        alone = found.lag >= -WAIT and not found.old
-        if found.odds > CERTAIN and (looked_back or alone):
-            return self._take(found)
-        alike = self._responses is not None or self._known or self._coarse
-        least = CERTAIN * ALIKE if alike else 1.0 / CERTAIN
-        if found.old and found.odds > least and not (alike and looked_back):
-            self._found, self._stage = found, 3
-        return False
+        now = self._ref.end
+        self._expected = None if self._open else self._announced.expected(now)
+        too_soon = self._open and now + 2 * self.hop - self._open[0].start < MINIMUM and not self._open[0].nearby
+        if too_soon or (not self._open and self._expected is None):
+            return
+        self._to_search = SEARCH_STRIDE
+        self._counts["searches"] += 1
+        if self._open and self._open[0].nearby > 0:
+            self._open[0].nearby -= 1
+            before = SIZE if self._open[0].nearby else SAMPLE_RATE // 2
+            self._open[0].start = now - int(self._drift.delay) - before
+        ref = self._expected or self._ref
+        self._lags.prepare(ref, now, self._expected.start if self._expected else self._open[0].start)
+        yield False
+        heard_out = self._open[0].after + int(self._drift.delay) if self._open and self._trusted else 0
+        together = self._used if self._responses is not None else self._used[:1]
+        self._lags.listen({at: self._mics[at] for at in together}, self._ref.end, heard_out)
+        yield False
+        found, looked_back = self._lags.find(), False
+        while found is not None:
+            # a reference that comes after its echo is rare: two windows must show it
+            if found.odds > CERTAIN and (looked_back or (found.lag >= -WAIT and not found.old)):
+                yield self._take(found)
+                return
+            yield False
+            alike = self._responses is not None or self._known or self._coarse
+            if not found.old or found.odds <= (CERTAIN * ALIKE if alike else 1.0 / CERTAIN) or (alike and looked_back):
+                return
+            first, looked_back = self._used[0], True
+            found = self._lags.before(first, self._mics[first], ref, found)
+        yield False
 
     def _take(self, found: Found) -> bool:
         """Accept this lag as the robot's; return whether the delay of the reference has changed."""
@@ -312,36 +396,30 @@ class Aligner:
         self._to_measure = STRIDE
         if self._ref.end - self._drift.delay - STRIDE > self._onsets.current.end:
             return False
-        self._far = bool(self._lost or (self._open and self._open[0].nearby))
+        far = bool(self._lost or (self._open and self._open[0].nearby))
         mic, drift = self._mics[self._used[0]], self._drift
-        found = self._meter.measure(mic, self._ref, self._ref.end, drift.delay, drift.slope, self._far)
-        return found is not None and self._take_look(found)
-
-    def _take_look(self, found: DelayMeasurement) -> bool:
-        """Take a look into account; True if the delay was switched."""
-        seen = self._drift.where_seen(found, found.gain if self._gain is None else self._gain, self._far)
+        found = self._meter.measure(mic, self._ref, self._ref.end, drift.delay, drift.slope, far)
+        seen = found and drift.where_seen(found, found.gain if self._gain is None else self._gain, far)
+        if found is None or seen == "drowned":
+            return False
         if seen == "there":
             return self._accept(found)
-        if seen == "drowned":
-            return False
         if self._coarse:  # without an arrival there is nothing to see until what is heard around this delay is learned
             self._meter.confirm(0.0)
             return False
         if seen == "jumped":
-            return self._accept(found) if abs(found.offset) < DRIFTED else self._jump(found.offset)
+            if abs(found.offset) < DRIFTED:
+                return self._accept(found)
+            self._counts["jumps"] += 1
+            self._log_odds = math.log(CERTAIN)
+            if self._open and self._ref.end - drift.delay > self._open[0].start + STRIDE:
+                self._resolve()
+            drift.step(found.offset, 0.3)
+            return self._switched()
         if seen == "elsewhere":
             self._to_measure = STRIDE // 2
         self._note_loss(found)
         return False
-
-    def _jump(self, offset: float) -> bool:
-        """Follow a jump of the delay by `offset` samples; True, as the delay was switched."""
-        self._counts["jumps"] += 1
-        self._log_odds = math.log(CERTAIN)
-        if self._open and self._ref.end - self._drift.delay > self._open[0].start + STRIDE:
-            self._resolve()
-        self._drift.step(offset, 0.3)
-        return self._switched()
 
     def _accept(self, found: DelayMeasurement) -> bool:
         step = self._drift.delay
@@ -364,26 +442,23 @@ class Aligner:
         self._lost += 1
         self._to_measure = STRIDE // 2
         self._log_odds = max(self._log_odds - UNSEEN, -SUREST)
-        if (
-            self._gain is None and self._log_odds < 0.0
-        ):  # no look has ever seen it: it may have been wrong from the start
-            self._trusted = False
-            self._open.append(Utterance(self._onsets.current.start, self._onsets.current.end, lost=True))
-        elif self._gain is not None and self._lost >= LOST_BLOCKS:
+        if self._gain is not None and self._lost >= LOST_BLOCKS:
             self._lost = 0
-            self._trusted = False
             self._open.append(Utterance(self._ref.end, self._ref.end, nearby=NEARBY_SEARCHES, lost=True))
+        elif self._gain is None and self._log_odds < 0.0:  # what no look has ever seen may be wrong from the start
+            self._open.append(Utterance(self._onsets.current.start, self._onsets.current.end, lost=True))
+        self._trusted = self._trusted and not self._open
 
     def _deliver(self, mic: Samples, before: float, switched: bool) -> Aligned:
-        state = self._state()
+        state, end, delay = self._state(), self._ref.end, self._drift.delay
         if not (self._known or self._coarse):
             nothing = self.history(self.hop)
-            anywhere = self._at_any_lag(mic, nothing, state)
-            return Aligned(nothing, float("nan"), 0.0, 0.0, state, switched, anywhere, self._wait)
-        if not HALF_WIDTH // 2 < self._drift.delay + self._wait < PRE_ROLL:
-            self._wait = min(max(HALF_WIDTH - round(self._drift.delay), 0), WAIT)
-        self._read_at = max(self._drift.delay + self._wait - self._margin, 0.0)
-        end = self._ref.end
+            return Aligned(
+                nothing, math.nan, 0.0, 0.0, state, switched, self._at_any_lag(mic, nothing, state), self._wait
+            )
+        if not HALF_WIDTH // 2 < delay + self._wait < PRE_ROLL:
+            self._wait = min(max(HALF_WIDTH - round(delay), 0), WAIT)
+        self._read_at = max(delay + self._wait - self._margin, 0.0)
         start = self._read_at - self._drift.slope * self.hop if switched else before
         if self._read_at < HALF_WIDTH:
             start = self._read_at = float(round(self._read_at))
@@ -392,13 +467,14 @@ class Aligner:
         reference = read_delayed(self._ref, end, self.hop, start, self._read_at)
         # one that is lost may only have moved away, and be softer there
         begun = self._known and self._open and not self._open[0].lost
-        if begun and not self._refuted and end - self._drift.delay > self._open[0].start:
-            self._refuted = self._cannot_be(mic)
+        if begun and self._gain is not None and end - delay > self._open[0].start:
+            brought = self._ref.read(end - round(delay) - self.hop, end - round(delay))
+            heard = float(np.dot(mic, mic))  # 10 dB less than the reference at that delay would bring there?
+            self._refuted = self._refuted or heard < 0.1 * self._gain * float(np.dot(brought, brought))
         if self._refuted:
             reference = np.zeros(self.hop, np.float32)
-        ppm = -1e6 * self._drift.slope
-        anywhere = self._at_any_lag(mic, reference, state)
-        return Aligned(reference, self._drift.delay, ppm, self._probability, state, switched, anywhere, self._wait)
+        ppm, anywhere = -1e6 * self._drift.slope, self._at_any_lag(mic, reference, state)
+        return Aligned(reference, delay, ppm, self._probability, state, switched, anywhere, self._wait)
 
     def _at_any_lag(self, mic: Samples, reference: Samples, state: AlignmentState) -> bool:
         """What `Aligned` says of it, for a hop of the microphone and the reference at the delay of before.
@@ -412,11 +488,3 @@ class Aligner:
             return waits and self._onsets.varies and (self._refuted or not self._known)
         waits = waits or self._expected is not None
         return self._first.step(mic, reference, self._onsets.peak, state, waits)
-
-    def _cannot_be(self, mic: Samples) -> bool:
-        """Whether the microphone holds 10 dB less than the reference at the old delay would bring there."""
-        if self._gain is None:
-            return False
-        stop = self._ref.end - round(self._drift.delay)
-        brought = self._ref.read(stop - self.hop, stop)
-        return float(np.dot(mic, mic)) < 0.1 * self._gain * float(np.dot(brought, brought))

@@ -11,16 +11,7 @@ import numpy as np
 from scipy.special import expit
 
 from edgefilter.alignment.delay_line import WAIT, DelayBuffer
-from edgefilter.alignment.lag_search import (
-    CERTAIN,
-    EARLY_ODDS,
-    MISSED,
-    MOST_LAG_S,
-    NEAR,
-    REFLECTIONS,
-    Found,
-    LagSearch,
-)
+from edgefilter.alignment.lag_search import CERTAIN, EARLY_ODDS, MISSED, MOST_LAG_S, NEAR, REFLECTIONS, Found, LagSearch
 from edgefilter.dsp.frames import decibels, stretch
 from edgefilter.dsp.lag import correlation_near, flat_cross, highest
 from edgefilter.errors import SignalError
@@ -193,17 +184,14 @@ def _reverberation_db(recording: Samples, reference: Samples, found: Belief) -> 
 
 def _looks(recording: Samples, reference: Samples) -> list[Found]:
     """What looks one after the other at the recording (n,) find in the reference (m,)."""
-    search, mic, ref = (
-        LagSearch(2 * REACH, window=LOOK),
-        DelayBuffer(REACH + recording.size),
-        DelayBuffer(reference.size),
-    )
+    search = LagSearch(2 * REACH, any_lag=(0, LOOK))
+    mic, ref = DelayBuffer(REACH + recording.size), DelayBuffer(reference.size)
     mic.push(np.zeros(REACH, np.float32))  # a lag of -REACH is none then
     mic.push(recording)
     ref.push(reference)
     looks, heard = [], REACH
     for stop in [*range(REACH + LOOK, mic.end, LOOK), mic.end]:
-        search.prepare(ref, stop, stop - search.span)
+        search.prepare(ref, stop)
         search.listen({0: mic}, stop, heard)
         if found := search.find():
             looks.append(replace(found, lag=found.lag - REACH, at=stop - REACH))

@@ -4,45 +4,16 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
 from edgefilter.dsp.fractional_delay import HALF_WIDTH, PHASES, tabulated
 from edgefilter.dsp.frames import stretch
-from edgefilter.types import AlignmentState, Array, Samples
+from edgefilter.types import Array, Samples
 
-UNLOCATED: tuple[AlignmentState, ...] = ("begun", "announced")
-"""States of the alignment in which the reference may lie elsewhere than the microphone hears it."""
 WAIT = 160
 """Samples, 10 ms, that the microphone waits at most for a reference that comes after its echo: the end of the latest frame is left to
 the next one, so that the output comes no later. At 13 ms of lateness frames are so short that a real device lost 4 dB of the human."""
-
-
-class Aligned(NamedTuple):
-    """The reference as an aligner delivers it for one hop of the microphone.
-
-    reference: (hop,) float32, delayed so that the robot's direct sound lies PRE_ROLL samples behind it; zeros while no
-    delay is known. delay: samples, of the direct sound at the end of the hop, nan if unknown. ppm: by how much it shrinks,
-    1e-6 samples per sample. confidence: probability that the delay is right, 0 to 1. realigned: the delay was switched
-    discontinuously in this hop. state: of the utterance that may be heard now. "idle": nothing of the reference can be
-    audible. "announced": it is waited for, and may begin at any time or never. "begun": it has begun and is not found yet;
-    delay is the one of before, or nan. "unfound": as "begun", but it should have been heard by now, whatever its lag.
-    "coarse": no sharp arrival was found yet, the delay is known to within 25 ms; the reference is early by as much. "lost":
-    it was found, but the last looks did not see it, beside a loud human or after a jump; delay is carried on, with its
-    drift. "locked": its delay is followed. at_any_lag: what is heard may be an utterance at a lag that nobody knows: it was
-    not found so far, and no delay is known, or the one of before was refuted; of a calibrated robot, it is too loud for
-    anybody else (FirstSounds). wait: samples by which the microphone must be delayed to fit the reference, WAIT at most.
-    """
-
-    reference: Samples
-    delay: float
-    ppm: float
-    confidence: float
-    state: AlignmentState
-    realigned: bool
-    at_any_lag: bool = False
-    wait: int = 0
 
 
 class DelayBuffer:

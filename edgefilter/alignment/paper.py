@@ -7,7 +7,8 @@ from collections import deque
 import numpy as np
 from scipy import fft
 
-from edgefilter.alignment.delay_line import Aligned, DelayBuffer
+from edgefilter.alignment.aligner import Aligned
+from edgefilter.alignment.delay_line import DelayBuffer
 from edgefilter.alignment.utterances import OnsetDetector
 from edgefilter.types import SAMPLE_RATE, AlignmentState, AlignmentStats, Samples
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from edgefilter.alignment.aligner import Aligner
-from edgefilter.alignment.delay_line import UNLOCATED, WAIT, Aligned
+from edgefilter.alignment.aligner import UNLOCATED, Aligned, Aligner
+from edgefilter.alignment.delay_line import WAIT
 from edgefilter.alignment.paper import PaperAligner
 from edgefilter.dsp import fourier
 from edgefilter.dsp.stft import Analyser

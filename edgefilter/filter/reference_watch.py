@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 import sys
 from collections import deque
-from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
-from edgefilter.alignment.aligner import LIKELY_LAG_S
-from edgefilter.alignment.belief import believed
-from edgefilter.alignment.delay_line import Aligned, DelayBuffer
-from edgefilter.alignment.lag_search import CERTAIN, EVEN, Found, LagSearch
-from edgefilter.alignment.utterances import FLOOR, VARIES, OnsetDetector, Sustained
+from edgefilter.alignment.aligner import FIRST_LOOK, LATEST, LOOKS, Aligned, Past
+from edgefilter.alignment.belief import Belief
+from edgefilter.alignment.lag_search import CERTAIN
+from edgefilter.alignment.utterances import FLOOR, VARIES, Sustained
 from edgefilter.dsp import fourier
 from edgefilter.dsp.lag import one_signal
 from edgefilter.filter.microphones import SILENT
@@ -24,13 +22,6 @@ from edgefilter.filter.robot_sound import LOUD, RobotSound
 from edgefilter.filter.volume import pre_emphasised
 from edgefilter.types import SAMPLE_RATE, EventKind, Frame, Samples
 
-LATEST = SAMPLE_RATE
-"""Samples by which a reference may be late and is still recognised as such. A look hears twice as many at most, so that half is left then."""
-LOOKS = 12
-"""Looks that are remembered: one after DOUBT of each utterance, then one every LATEST, and one at each realignment."""
-DOUBT = SAMPLE_RATE // 2
-"""Samples for which speech that begins while the reference is silent waits for it, until it is known to come in time: an
-onset of the robot's is no human's if the reference follows."""
 OTHERS = 0.2
 """Share of the looks in which the microphone hears something where the robot plays unheard, into headphones, say: people take turns with
 it; and of those in which it hears nothing where a sound is played."""
@@ -48,13 +39,10 @@ Verdict = Literal["unknown", "fits", "late"]
 
 
 class ReferenceWatch:
-    """Looks at both channels beside the aligner, hop by hop, and says once what is wrong with the reference.
+    """Says once what is wrong with the reference, hop by hop, of what the aligner believes and of how loud both channels are.
 
-    Where the reference is, and whether it comes after its echo, is believed as of a whole recording (`believed`), from the
-    latest looks: what the aligner follows is one, and where it follows nothing, or the reference was late, both channels are
-    searched, at lags either way: a sentence that resembles an earlier one, whose echo still sounds, is found at both its lags,
-    and so at none. hop: samples a step. bins: of a spectrum. verdict: "late" or "fits" once either is certain. without:
-    whether the robot is heard while the reference is silent. same: whether microphone and reference are one signal.
+    hop: samples a step. bins: of a spectrum. verdict: "late" or "fits" once either is certain. without: whether the robot is
+    heard while the reference is silent. same: whether microphone and reference are one signal.
 
     >>> watch = ReferenceWatch(256, 257)
     >>> watch.verdict, watch.wait
@@ -63,13 +51,9 @@ class ReferenceWatch:
 
     def __init__(self, hop: int, bins: int) -> None:
         self._hop = hop
-        self._search = LagSearch(round(LIKELY_LAG_S * SAMPLE_RATE), early=LATEST, window=2 * LATEST)
-        self._mic, self._ref = (DelayBuffer(self._search.span + LENGTH) for _ in range(2))
-        self._onsets = OnsetDetector(hop)
         self.verdict: Verdict = "unknown"
         self.without = self.same = False
-        self._looks: deque[Found] = deque(maxlen=LOOKS)
-        self._late = self._stage = self._next = self._looked = 0
+        self._late = 0
         self._missing, self._grew, self._another = "", False, False
         self._speed: float | None = None
         self._off_speed, self._to_compare, self._compared = False, 0, 0
@@ -101,23 +85,22 @@ class ReferenceWatch:
             return 0
         if not self._idle:  # what has begun is told once it is found that the reference fits, never if it is late
             return sys.maxsize
-        return max(DOUBT, self._late)
+        return max(FIRST_LOOK, self._late)
 
     def step(
         self, mic: Samples, ref: Samples, aligned: Aligned, frame: Frame, removal: Removal, speaking: bool
     ) -> list[tuple[EventKind, str]]:
         """Take a hop (hop,) of both channels and what was made of it; what is to be said. speaking: whether a human is."""
-        self._mic.push(mic)
-        self._ref.push(ref)
-        if self._onsets.step(ref):
-            self._next, self._loudest = self._ref.end + DOUBT, 0.0
+        begun = aligned.past.onsets.current
+        if begun.end - begun.start == 2 * self._hop:
+            self._loudest = 0.0
         self._idle = aligned.state in ("idle", "announced")  # announced speech is no reference before its echo is heard
         power, played = float(mic.dot(mic)) / self._hop, float(ref.dot(ref)) / self._hop
         self._loudest = max(self._loudest, self._sustained.step(power))
         if power > FLOOR:
             self._least = min(power, self._rise * self._least)
         checks: tuple[tuple[EventKind, str], ...] = (
-            ("reference_late", self._look(aligned)),
+            ("reference_late", self._late_by(aligned.belief, aligned.past)),
             ("robot_unfound", self._unheard(aligned)),
             ("echo_unpredicted", self._unpredicted(removal)),
             ("same_signal", self._same(pre_emphasised(mic), pre_emphasised(ref))),
@@ -160,15 +143,16 @@ class ReferenceWatch:
         if aligned.state == "locked":
             self._off_speed, self._speed = False, None
             return ""
-        start = self._ref.end - round(SPEEDS[0] * LENGTH)
-        if not self._onsets.active or start < self._onsets.current.start or self._compared == SPEED_LOOKS:
+        heard, ref, onsets = aligned.past
+        start = ref.end - round(SPEEDS[0] * LENGTH)
+        if not onsets.active or start < onsets.current.start or self._compared == SPEED_LOOKS:
             return ""
         self._to_compare -= self._hop
         if self._to_compare > 0:
             return ""
         self._to_compare, self._compared = SPEED_STRIDE, self._compared + 1
         before = self._speed
-        self._speed = other_speed(self._mic.read(start, start + LENGTH), self._ref.read(start, self._ref.end))
+        self._speed = other_speed(heard.read(start, start + LENGTH), ref.read(start, ref.end))
         if self._speed is None or self._speed != before:
             return ""
         self._off_speed = True
@@ -200,13 +184,13 @@ class ReferenceWatch:
 
     def _listen_without(self, played: float, aligned: Aligned, frame: Frame, speaking: bool) -> str:
         """Learn the spectrum of the robot at the microphone, and look for it there while the reference is silent."""
-        now = self._ref.end
+        now = aligned.past.ref.end
         if played > FELL_SILENT * self._played:
             self._played_at, self.without = now, False
             self._sound.forget()
         if aligned.state in ("locked", "coarse") and not speaking:
             brought = float(aligned.reference.dot(aligned.reference)) / self._hop
-            if brought > LOUD * self._onsets.peak:
+            if brought > LOUD * aligned.past.onsets.peak:
                 self._played += 0.01 * (brought - self._played) if self._played else brought
                 self._sound.learn(fourier.power(frame.mic))
         lag = LATEST if math.isnan(aligned.delay) else int(aligned.delay)
@@ -222,32 +206,14 @@ class ReferenceWatch:
             " device?"
         )
 
-    def _look(self, aligned: Aligned) -> str:
-        """Take a look, in three hops, or the lag that the aligner follows for one; say once that the reference is late."""
-        now, stage, self._stage = self._ref.end, self._stage, 0
-        found = None
-        if aligned.state in ("locked", "coarse") and self.verdict != "late":
-            if aligned.realigned or now >= self._next:
-                sure = CERTAIN / (CERTAIN + 1.0) if aligned.state == "coarse" else aligned.confidence
-                found, self._next = Found.followed(round(aligned.delay), sure, now), now + LATEST
-        elif stage == 1:
-            self._stage = 2
-            self._search.listen({0: self._mic}, now, self._looked)
-        elif stage == 2:
-            found = self._search.find() or Found(0, 0.0, now)  # a silent microphone does not show the robot either
-            self._looked = now + min(found.lag, 0)  # at that lag the next look hears what this one did not
-        elif self._onsets.active and now >= self._next:
-            self._next, self._stage = now + LATEST, 1
-            self._search.prepare(self._ref, now, now - self._search.span)
-        if found is None:
+    def _late_by(self, belief: Belief | None, past: Past) -> str:
+        """Take in what is believed after another look; say once that the reference is late."""
+        if belief is None:
             return ""
-        # where a robot says something again, so does chance: what is more likely wrong than right is not believed if it agrees
-        self._looks.append(found if found.clearness > EVEN else replace(found, clearness=0.0))
-        belief = believed(self._looks)
         self._grew, late = bool((belief.steps[0][-1:] > 0).any()), belief.late[-1]
         if belief.missing or belief.lossy <= 1.0:  # once certain, as long as any look speaks for it
             self._missing = belief.missing
-        if self._onsets.varies:
+        if past.onsets.varies:
             self._levels.append(self._loudest / self._least)
         # of a robot that is heard some looks show the lag, of one that is not few a voice: where neither is so, it is another sound
         sounding = 2 * sum(level > VARIES for level in self._levels) - len(self._levels)

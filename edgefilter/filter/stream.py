@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from edgefilter.alignment.delay_line import Aligned
+from edgefilter.alignment.aligner import Aligned
 from edgefilter.dsp import fourier
 from edgefilter.dsp.ring import Ring
 from edgefilter.dsp.stft import Synthesiser

@@ -5,8 +5,7 @@ import pytest
 import soundfile
 
 from edgefilter import EgoFilter, enhance
-from edgefilter.alignment.aligner import Aligner
-from edgefilter.alignment.delay_line import Aligned
+from edgefilter.alignment.aligner import Aligned, Aligner
 from edgefilter.alignment.lag_search import MOST_LAG_S
 from edgefilter.alignment.utterances import LONGEST, FirstSounds
 from edgefilter.filter.budget import DEMO

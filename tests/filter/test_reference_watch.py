@@ -10,7 +10,7 @@ from scipy import signal
 
 import edgefilter
 from edgefilter import EgoFilter
-from edgefilter.alignment.delay_line import Aligned
+from edgefilter.alignment.aligner import Aligned
 from edgefilter.filter.barge_in import BargeIn
 from edgefilter.filter.reference_watch import ReferenceWatch
 from edgefilter.filter.removal import Removal
