@@ -465,8 +465,8 @@ class Aligner:
         if abs(start - self._read_at) > 0.5:
             start, switched = self._read_at - self._drift.slope * self.hop, True
         reference = read_delayed(self._ref, end, self.hop, start, self._read_at)
-        # one that is lost may only have moved away, and be softer there
-        begun = self._known and self._open and not self._open[0].lost
+        # one that is lost may only have moved away, and be softer there, unless samples are missing: then its lag has grown again
+        begun = self._known and self._open and (not self._open[0].lost or self._belief.lost)
         if begun and self._gain is not None and end - delay > self._open[0].start:
             brought = self._ref.read(end - round(delay) - self.hop, end - round(delay))
             heard = float(np.dot(mic, mic))  # 10 dB less than the reference at that delay would bring there?
