@@ -40,6 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DB",
         help="barge-in: by how much a robot lowers its voice that is asked to",
     )
+    add("--sound", type=Path, metavar="DIR", help="barge-in: folder for WAV files of what robots play and hear")
     add("--real", type=Path, metavar="DIR", help="barge-in: recordings of a real loudspeaker alone")
 
 

@@ -10,8 +10,9 @@ sound. The recogniser gets the human's span of what each of them leaves.
 Backchannels: the same scenes, with a short word or a cough in the place of the interruption. False stops: the robot
 alone for --minutes of its speech (--alone: its voices), in new rooms all the time, half of them with loudspeakers of
 strong distortion and half without a calibration, and recordings of a real loudspeaker (--real) that nothing was tuned
-on. --ask-db: interruptions and false stops with a robot that lowers its voice where the filter asks for it. Rows are kept
-in --cache as they are made: a run that was cut off, or is asked for more minutes, goes on there.
+on. --ask-db: interruptions and false stops with a robot that lowers its voice where the filter asks for it; --sound: what
+each of them plays that is interrupted and calibrated, on the left, and what its microphone hears. Rows are kept in --cache
+as they are made: a run that was cut off, or is asked for more minutes, goes on there.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from typing import NamedTuple
 
 import jiwer
 import numpy as np
+import soundfile
 
 from bench import provenance, results
 from bench.cache import Cache
@@ -88,12 +90,14 @@ SHORT = {"word": "a word of 0.3-0.5 s", "cough": "a cough"}
 class Robot(NamedTuple):
     """A robot that lowers its voice by ask_db where the filter asks for it.
 
-    echo: of the microphone, (n,), what it says; late: samples by which that is later than in the reference.
+    echo: of the microphone, (n,), what it says; late: samples by which that is later than in the reference. file: for what it
+    plays and its microphone hears, in stereo.
     """
 
     echo: Samples
     late: int
     ask_db: float
+    file: Path | None = None
 
 
 def listen(mic: Samples, ref: Samples, profile: Profile | None, engine: str, robot: Robot | None = None) -> Output:
@@ -104,26 +108,27 @@ def listen(mic: Samples, ref: Samples, profile: Profile | None, engine: str, rob
     fade, gains = Fade(), np.ones(mic.size, np.float32)
     for at in range(0, mic.size, ego.hop):
         block = slice(at, min(at + ego.hop, mic.size))
-        heard = mic[block]
         if robot:
             fade.wanted = ego.voice_gain
             gains[block] = fade.apply(gains[block], SAMPLE_RATE)
             then = np.arange(block.start, block.stop) - robot.late
-            heard = heard + (np.where(then < 0, 1.0, gains[then]) - 1.0).astype(np.float32) * robot.echo[block]
-        done.append(ego.process(heard, gains[block] * ref[block]))
+            mic[block] += (np.where(then < 0, 1.0, gains[then]) - 1.0).astype(np.float32) * robot.echo[block]
+        done.append(ego.process(mic[block], gains[block] * ref[block]))
         probability.append(ego.speech_probability)
+    if robot and robot.file:
+        soundfile.write(robot.file, np.stack((gains * ref, mic), axis=1), SAMPLE_RATE)
     events = [event for event in ego.events() if event.kind.startswith(("speech", "voice"))]
     return Output(np.concatenate((*done, ego.flush())), events, probability, ego.hop)
 
 
-def measure(scene: Scene, engine: str, recogniser: Recogniser | None, ask_db: float) -> dict:
+def measure(scene: Scene, engine: str, recogniser: Recogniser | None, ask_db: float, file: Path | None = None) -> dict:
     """Ready for JSON: noticed with a calibration and without, words under each policy, backchannels."""
     signals, meta = scene.signals, scene.meta
     ref, onset = signals["ref"], first_sound(signals["clean"].astype(np.float32))
     profile = calibrate(*(signals[name].astype(np.float32) for name in CALIBRATION))
     late = meta.get("lag2", meta["lag"]) + meta["delay"]  # of the second utterance, which is interrupted
     robot = Robot(scene.echo(ref).astype(np.float32), late, ask_db)
-    talk = listen(signals["mic"], ref, profile, engine, robot)
+    talk = listen(signals["mic"], ref, profile, engine, robot._replace(file=file))
     row = {name: meta[name] for name in ("room", "voice", "speaker", "text", "sisdr_mix")}
     row["calibrated"] = when(talk, onset)
     row["cold"] = when(listen(signals["mic"], ref, None, engine, robot), onset)
@@ -308,11 +313,13 @@ def run(options: argparse.Namespace) -> str:
     )
     speech, voices = read_clips(options.speech, (3.0, 12.0)), read_voices(options.voices)
     rows = []
+    if options.sound:
+        options.sound.mkdir(parents=True, exist_ok=True)
     for index in progress(range(options.count), "conversation"):
 
         def made(index: int = index) -> dict:
             scene = make_scene(options.seed, index, KINDS[index // 2 % 2], speech, voices)
-            return measure(scene, engine, recogniser, options.ask_db)
+            return measure(scene, engine, recogniser, options.ask_db, options.sound and options.sound / f"{index}.wav")
 
         rows.append(kept.get(made, of, "conversation", index))
     alone = monologues(options.alone, options.minutes, options.seed, engine, options.ask_db, kept, of)

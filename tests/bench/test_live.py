@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import soundfile
 
 from bench import __main__ as bench
 from bench.live import barge_in, click, soak, trial
@@ -313,7 +314,9 @@ def test_interruptions_and_false_stops_from_end_to_end(
     assert not asked and again["tables"] == found["tables"]
 
 
-def test_a_robot_that_asks_is_heard_lower_as_late_as_its_sound_comes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_robot_that_asks_is_heard_lower_as_late_as_its_sound_comes(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     heard = []
 
     class Asking:
@@ -341,8 +344,10 @@ def test_a_robot_that_asks_is_heard_lower_as_late_as_its_sound_comes(monkeypatch
 
     monkeypatch.setattr(barge_in, "EgoFilter", Asking)
     ones, late = np.ones(50 * 256, np.float32), 5 * 256
-    barge_in.listen(1.5 * ones, ones, None, "crnn", barge_in.Robot(ones, late, 12.0))
+    barge_in.listen(1.5 * ones, ones, None, "crnn", barge_in.Robot(ones, late, 12.0, tmp_path / "it.wav"))
     mic, ref = (np.concatenate(part) for part in zip(*heard))
+    written, _ = soundfile.read(tmp_path / "it.wav")
+    np.testing.assert_allclose(written, np.clip(np.stack((ref, mic), axis=1), -1.0, 1.0), atol=1e-4)
     lowered = np.flatnonzero(ref < 0.3)
     assert 10 * 256 < lowered[0] < 11 * 256 and 20 * 256 <= lowered[-1] < 21 * 256
     np.testing.assert_allclose(mic[late:], 0.5 + ref[:-late], atol=1e-6)
