@@ -29,6 +29,12 @@ half of 19 real and simulated devices; on the others false starts fall from 20 t
 and of 49 humans noticed within 0.5 s 48 still are, of whom the median one waits 24 ms longer. With 0.2 there are 12 false
 starts, with 0.03 there are 7, and 47 humans in time."""
 
+UNASKED = 1e-4
+"""Rate of that test at which a calibrated robot takes who speaks for a human before the lower voice is heard: log-odds of 9.2.
+Of 124 such robots of the recipe `field` alone, 25 minutes in closed loop, none that asking had dismissed came above 8.7: 9 false
+starts stay 9 (17 without asking), and of 55 interruptions 51 % are believed within 0.4 s, not 29 (60 without asking). Of 75
+robots without a calibration 3 more would be started falsely, of 5 that asking saves: they always ask."""
+
 
 @dataclass(frozen=True)
 class BargeInSettings:
@@ -43,8 +49,9 @@ class BargeInSettings:
     sentence. min_silence_s: how long the silence lasts before speech has ended; 0.5 s bridges the pauses within a
     sentence, 0.2 s tells a recogniser sooner. judge: "engine", or "network" to let crnn's network judge beside an engine
     that judges no speech (`ss`, `linear`), at what crnn costs. ask_db: by how much the robot lowers its voice, dB, while
-    somebody is suspected to speak; 0, never. What is heard with the lower voice then decides. It needs a player that
-    follows `EgoFilter.voice_gain`; 12 dB is what one person does when another begins to talk.
+    somebody is suspected to speak; 0, never. What is heard with the lower voice then decides, unless a calibrated robot is
+    certain before. It needs a player that follows `EgoFilter.voice_gain`; 12 dB is what one person does when another begins
+    to talk.
     Raises UsageError for probabilities outside 0 to 1, a release above the threshold, negative times or decibels, or another judge.
     """
 
@@ -74,26 +81,27 @@ class BargeIn:
     Speech is suspected in the first hop that reaches the threshold. The log-odds of the hops that follow, less those of
     the threshold, are added up (Wald 1945, "Sequential tests of statistical hypotheses"): at the bounds of an ERROR, or
     by their sign when the time to confirm is over, speech has begun, or the suspicion is dismissed. Where the robot lowers
-    its voice meanwhile, those bounds only tell whether anybody speaks, and a human is who is still heard with the lower
-    voice: from then on the sum begins anew and never falls below 0 (Page 1954, "Continuous inspection schemes"), and who
-    has not reached the upper bound within the time to confirm was the robot.
-    hop_s: seconds between two probabilities. settings: None for the defaults.
+    its voice meanwhile, those bounds only tell whether anybody speaks, and a human is who reaches the bound of UNASKED, or is
+    still heard with the lower voice: from then on the sum begins anew and never falls below 0 (Page 1954, "Continuous
+    inspection schemes"), and who has not reached the upper bound within the time to confirm was the robot.
+    hop_s: seconds between two probabilities. settings: None for the defaults. calibrated: whether the robot is.
 
     >>> talk = BargeIn(0.016)
     >>> [talk.note(probability) for probability in (0.2, 0.98, 0.99, 0.995, 0.995)]
     [None, 'speech_suspected', None, 'speech_started', None]
     """
 
-    def __init__(self, hop_s: float, settings: BargeInSettings | None = None) -> None:
+    def __init__(self, hop_s: float, settings: BargeInSettings | None = None, calibrated: bool = False) -> None:
         self.settings = settings = settings or BargeInSettings()
         self._pause = max(1, round(settings.min_silence_s / hop_s))
         self._longest = round(settings.confirm_s / hop_s)
-        self._threshold, self._bound = log_odds(settings.threshold), log_odds(1.0 - ERROR)
+        self._threshold = log_odds(settings.threshold)
+        self._bound, self._sure = log_odds(1.0 - ERROR), log_odds(1.0 - UNASKED) if calibrated else math.inf
         self._silent = 0
         self._forget()
 
     def _forget(self) -> None:
-        self._hops, self._asked, self._evidence, self._certain = 0, 0, 0.0, False
+        self._hops, self._asked, self._evidence, self._somebody, self._certain = 0, 0, 0.0, False, False
         self._told: EventKind | None = None
 
     @property
@@ -154,12 +162,11 @@ class BargeIn:
             self._evidence = max(self._evidence, 0.0)
             self._certain = self._evidence >= self._bound
             return self._certain or self._hops < self._asked + self._longest
-        decided = self._hops >= self._longest or abs(self._evidence) >= self._bound
-        if decided and self._asked and self._evidence >= 0.0:
-            self._evidence = math.inf  # somebody speaks; whether it is the robot, the lower voice will tell
-            return True
-        self._certain = decided and self._evidence >= 0.0
-        return self._certain or not decided
+        late = self._hops >= self._longest
+        self._somebody |= self._evidence >= (0.0 if late else self._bound)
+        # whether it is the robot that was asked, the lower voice will tell
+        self._certain = self._somebody and (not self._asked or self._evidence >= self._sure)
+        return self._somebody or (self._evidence > -self._bound and not late)
 
 
 def human_probability(probability: float, unexplained: float = 1.0) -> float:

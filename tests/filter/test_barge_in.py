@@ -67,10 +67,10 @@ def test_of_independent_hops_with_true_odds_no_more_are_decided_wrongly_than_is_
 
 
 def test_where_the_robot_lowers_its_voice_what_is_heard_of_the_lower_one_decides():
-    sure, after, longest = [0.999] * 5, 5, round(BargeInSettings.confirm_s / HOP_S)
+    sure, after, longest = [0.99] * 5, 5, round(BargeInSettings.confirm_s / HOP_S)
 
-    def asked(*probabilities):
-        talk = BargeIn(HOP_S)
+    def asked(*probabilities, calibrated=False):
+        talk = BargeIn(HOP_S, calibrated=calibrated)
         return [(talk.note(probability, heard_after=after), talk.asking) for probability in probabilities]
 
     for then, what, at in (
@@ -82,6 +82,9 @@ def test_where_the_robot_lowers_its_voice_what_is_heard_of_the_lower_one_decides
         found = asked(*sure, *then)  # what came before the lower voice was heard does not count
         assert [(i, told) for i, (told, _) in enumerate(found) if told][:2] == [(0, "speech_suspected"), (at, what)]
         assert all(asking for _, asking in found[:at]) and not found[at][1]
+    for calibrated, what in ((True, "speech_started"), (False, None)):
+        found = asked(*[0.9999] * 3, calibrated=calibrated)
+        assert found[-1] == (what, not calibrated)  # what is beyond doubt needs none
     found = asked(0.98, 1e-4)
     assert found[1] == ("speech_dismissed", False)  # what is clearly nobody needs no lower voice
     talk = BargeIn(HOP_S)
