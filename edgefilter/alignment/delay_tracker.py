@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from edgefilter.alignment.delay_line import DelayBuffer
-from edgefilter.alignment.lag_search import NEAR
+from edgefilter.alignment.lag_search import CERTAIN, NEAR
 from edgefilter.alignment.utterances import FLOOR
 from edgefilter.dsp import fourier
 from edgefilter.dsp.fourier import power
@@ -26,14 +26,15 @@ REACH = 1024
 SIZE = FRAME + 2 * REACH
 EARLY = (48, 400)
 """Samples before and after the direct sound that the learnt response keeps."""
-SMALL, CERTAIN_SMALL, CERTAIN, CERTAIN_FAR = 8.0, 20.0, 30.0, 50.0
-"""A jump is believed from CERTAIN of evidence on, summed over looks that agree; one of up to SMALL samples from
-CERTAIN_SMALL on, and one beyond REACH from CERTAIN_FAR on, for chance has more to choose from. In 7 minutes of human speech
-while the reference played unheard, the sums reached 19 within REACH and 29 beyond. Their tails are exponential: 30 comes
-about once in 100 hours of such speech, 50 beyond REACH once in 5 if all looks went that far."""
-ONE_LOOK = 28.0
-"""Evidence that one look can have at most: what is heard in an eighth of a second through a microphone that is processed may agree
-with the reference at any delay, so a jump of more than SMALL samples takes two looks that agree."""
+SMALL = 8.0
+"""Samples of a jump up to which it may also be a wrong slope, and is half as likely as to any other lag within REACH."""
+CHANCE, FAR = 2.47, 1000.0
+"""Evidence by which a jump gets e times as likely, and by how much one beyond REACH is less likely than one within. In 7 minutes of human
+speech while the reference played unheard, looks that agree had up to 19 within REACH and 29 beyond, with exponential tails: a jump
+that is certain, of 30 or 50, comes about once in 100 hours of such speech, and beyond REACH once in 5 if all looks went that far."""
+ONE_LOOK = math.log(CERTAIN * 2 * REACH)
+"""Logarithm of the likelihood ratio that one look shows at most, with which a jump within REACH is as good as certain: what is heard in an
+eighth of a second through a microphone that is processed may agree with the reference at any delay."""
 AGREE = 0.7
 """Samples within which two looks see the same jump."""
 FORGET = 0.7
@@ -322,7 +323,7 @@ class DriftFilter:
         While the delay is hardly known, a weak look may also have seen another peak than the direct sound's.
         """
         common = BIAS**2 * (1.0 - measurement.explained)
-        doubtful = self._variance > 0.25 and measurement.evidence < CERTAIN
+        doubtful = self._variance > 0.25 and measurement.evidence / CHANCE < ONE_LOOK
         return measurement.variance + common + (1.0 if doubtful else 0.0)
 
     def _expected(self) -> tuple[float, float, float]:
@@ -334,7 +335,7 @@ class DriftFilter:
 
 
 class JumpWitness:
-    """Remembers the most suspicious jump of late, and the evidence for it.
+    """Remembers the most suspicious jump of late, and how much more likely than chance it makes what was seen.
 
     >>> look = DelayMeasurement(100.0, 0.01, strength=10.0, ratio=1.6, dominance=5.0, explained=0.5, gain=1.0, gain_there=1.0)
     >>> witness = JumpWitness()
@@ -347,18 +348,18 @@ class JumpWitness:
 
     def forget(self) -> None:
         """The delay was confirmed or replaced."""
-        self._offset, self._evidence = float("nan"), 0.0
+        self._offset, self._shown = float("nan"), 0.0
 
     def convinced(self, found: DelayMeasurement) -> bool:
-        """Take in a look at which the delay seems to have jumped by its offset; True if that is now beyond chance."""
-        evidence = min(found.evidence, ONE_LOOK)
+        """Take in a look at which the delay seems to have jumped by its offset; True if that is certain now."""
+        shown, size = min(found.evidence / CHANCE, ONE_LOOK), abs(found.offset)
         if abs(found.offset - self._offset) < AGREE:
-            self._evidence += evidence
+            self._shown += shown
         else:
-            self._evidence *= FORGET
-            if evidence <= self._evidence:
+            self._shown *= FORGET
+            if shown <= self._shown:
                 return False
-            self._evidence = evidence
+            self._shown = shown
         self._offset = found.offset
-        size = abs(found.offset)
-        return self._evidence > (CERTAIN_SMALL if size <= SMALL else CERTAIN if size <= REACH else CERTAIN_FAR)
+        lags = 4 * SMALL + 1 if size <= SMALL else 2 * REACH if size <= REACH else FAR * 6 * REACH
+        return self._shown > math.log(CERTAIN * lags)
