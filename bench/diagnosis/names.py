@@ -88,12 +88,14 @@ class Outcome:
 
     @property
     def family_hit(self) -> bool:
-        """Of a single effect: whether what is named first is of its family, or of that of another name that is right."""
+        """Whether what is named first is of the family of a single effect, or of another name that is right; of several, all families are named."""
+        if self.group == "pairs":
+            return {find(name).family for name in self.truth} <= {find(name).family for name in self.named}
         return bool(self.named) and find(self.first).family in {find(name).family for name in self.right}
 
     @property
     def hit(self) -> bool:
-        """Singles: named first. Pairs: both named. Controls: explained. Outside: unexplained. Sealed: the exact label."""
+        """Singles: named first. Several: all named. Controls: explained. Outside: unexplained. Sealed: the exact label."""
         if self.group == "sealed":
             return bool(self.sealed_hit)
         if self.group in ("controls", "outside"):
@@ -171,9 +173,10 @@ def counts(found: Sequence[Outcome]) -> dict[str, dict]:
         flags[f"among the first two, {strength}"] = [bool(set(one.right) & set(one.named[:2])) for one in of]
     flags["that effect and no other"] = [one.label in one.right for one in singles]
     flags["nothing: false alarms"] = [not one.hit for one in controls]
-    flags["two effects: both named"] = [one.hit for one in pairs]
+    flags["several effects: all named"] = [one.hit for one in pairs]
+    flags["all of their families named"] = [one.family_hit for one in pairs]
     flags["at least one named"] = [bool(set(one.truth) & set(one.named)) for one in pairs]
-    flags["both and no other"] = [set(one.truth) == set(one.named) for one in pairs]
+    flags["all and no other"] = [set(one.truth) == set(one.named) for one in pairs]
     flags["outside the catalogue: unexplained"] = [one.hit for one in outside]
     wrong = [one.verdict == "explained" and one.excess_db > EXPLAINED_LIMIT_DB for one in outside]
     flags["explained above 1 dB of excess"] = wrong

@@ -6,7 +6,8 @@ A case is a folder HALF_NUMBER as bench.simulate.hidden_cases writes them; truth
 are right (also; a volume, where at its setting the program does no more), which program it was and its setting. The
 programs come in turn, every tenth case is a control; a setting is drawn again, at most six times, while it changes less
 than LEAST_DB over the fan. Robot, room and tolerances are those of hidden_robot. The halves `reporting` and `unseen` are
-for figures, never for tuning: no two halves share a suite.
+for figures, never for tuning: no two halves share a suite. `combined` hides two or three effects at once, by programs of `tuning`
+and a fan that has changed; each changes LEAST_DB beside those before it.
 
 Debian: sox ffmpeg swh-plugins tap-plugins cmt caps invada-studio-plugins-ladspa zam-plugins vlevel lame opus-tools speex
 libgsm-tools fil-plugins rev-plugins guitarix-ladspa blop vorbis-tools dpf-plugins-ladspa. PyPI: pedalboard noisereduce webrtc-noise-gain.
@@ -20,7 +21,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -32,7 +33,7 @@ from tqdm import tqdm
 
 from bench.simulate.conversations import Voices, read_voices, write_item
 from bench.simulate.hidden_cases import read_reference, scale
-from bench.simulate.hidden_effects import log_uniform, put_back
+from bench.simulate.hidden_effects import fan_noise, log_uniform, put_back
 from bench.simulate.hidden_robot import Chain, Place, Scene, decibels, direction, draw_scene, power
 from bench.simulate.simulated_robot import RATE, Array, Rng
 
@@ -68,11 +69,11 @@ class Program:
     """One effect of one program: where it stands, the names that are right, and a setting drawn at random.
 
     right: the first is what the manual says that the effect does, others that are right as well stand behind it. draw:
-    None for a simulator of rooms, which is given the room itself.
+    None for a simulator of rooms, which is given the room itself, and for the fan's own of hidden_effects.
     """
 
     name: str
-    place: Literal["source", "room", "microphone"]
+    place: Literal["source", "room", "microphone", "fan"]
     right: tuple[str, ...]
     draw: Callable[[Rng], Command] | None
 
@@ -451,15 +452,32 @@ UNTRIED: tuple[Program, ...] = (
 # fmt: on
 
 HALVES = {"tuning": TUNING, "reporting": REPORTING, "unseen": UNSEEN, "untried": UNTRIED}
-CONTROL = Program("none", "source", ("none",), None)
+FAN = Program("fan", "fan", ("fan_noise",), None)
+COMBINED: tuple[tuple[str, ...], ...] = (
+    ("swh triplePara", "swh foverdrive"),
+    ("sox gain", "sox reverb"),
+    ("sox compand", "pyroomacoustics, robot moved"),
+    ("swh foverdrive", "sox speed"),
+    ("sox reverb", "fan"),
+    ("swh triplePara", "swh foverdrive", "sox reverb"),
+    ("sox gain", "sox speed", "fan"),
+)
+"""What happens together: an equaliser and a clipper, a volume and a room, a compressor and another place, a clipper and a clock, a room
+and a fan, and three at once. Each of the programs has one right name."""
 
 
-def program_of(half: str, index: int) -> Program:
-    """Every EVERY-th case is a control; the others take the programs in turn."""
+def programs_of(half: str, index: int) -> tuple[Program, ...]:
+    """Every EVERY-th case is a control, without any; the others take the half's programs, or its combinations, in turn."""
     if index % EVERY == EVERY - 1:
-        return CONTROL
-    programs = HALVES[half]
-    return programs[(index - index // EVERY) % len(programs)]
+        return ()
+    turn = index - index // EVERY
+    if half != "combined":
+        return (HALVES[half][turn % len(HALVES[half])],)
+    known = {program.name: program for program in (*TUNING, FAN)}
+    return tuple(known[name] for name in COMBINED[turn % len(COMBINED)])
+
+
+SETS = (*sorted(HALVES), "combined")
 
 
 def moved(rng: Rng, place: Place, program: Program) -> tuple[Place, str]:
@@ -471,11 +489,11 @@ def moved(rng: Rng, place: Place, program: Program) -> tuple[Place, str]:
     return place.microphone_moved(step), f"microphone moved by {100 * np.linalg.norm(step):.1f} cm"
 
 
-def through(rng: Rng, scene: Scene, program: Program) -> tuple[Chain, str]:
-    """The usual chain with a setting of the program in its place, and the words for that setting."""
-    chain = scene.usual
-    if program is CONTROL:
-        return chain, ""
+def through(rng: Rng, scene: Scene, chain: Chain, program: Program) -> tuple[Chain, str]:
+    """The chain with a setting of the program in its place, and the words for that setting."""
+    if program is FAN:
+        changed, setting = fan_noise(rng, scene, chain, "clear")
+        return changed, f"fan {setting['kind']}, {setting['change_db']:.1f} dB"
     start, fade, response = chain.paths[0]
     if program.draw is None:
         place, words = moved(rng, scene.moved, program)
@@ -484,9 +502,20 @@ def through(rng: Rng, scene: Scene, program: Program) -> tuple[Chain, str]:
     if program.place == "source":
         return replace(chain, played=command(chain.played)), command.words
     if program.place == "microphone":
-        return replace(chain, microphone=(command,)), command.words
+        return replace(chain, microphone=(*chain.microphone, command)), command.words
     longer = np.pad(response, (0, round(TAIL_S * RATE)))
     return replace(chain, paths=((start, fade, command(longer)),)), command.words
+
+
+def hidden(rng: Rng, scene: Scene, programs: Sequence[Program]) -> tuple[Array, list[str], float]:
+    """The recording (n,) through all programs, the words for their settings, and the least that one of them changes, dB over the fan."""
+    chain, said, mic, least = scene.usual, [], scene.record(scene.usual), np.inf
+    for program in programs:
+        chain, words = through(rng, scene, chain, program)
+        before, mic = mic, scene.record(chain)
+        said.append(words)
+        least = min(least, scene.over_fan_db(put_back(mic, before) - before))
+    return mic, said, least
 
 
 def is_a_volume(scene: Scene, change: Array) -> bool:
@@ -498,24 +527,25 @@ def is_a_volume(scene: Scene, change: Array) -> bool:
 
 def make_case(seed: int, index: int, half: str, voices: Voices) -> tuple[dict[str, Array], dict]:
     """Signals by name (n,) and the contents of truth.json, for case index of this seed and half."""
-    rng = np.random.default_rng([seed, sorted(HALVES).index(half), index])
-    program = program_of(half, index)
+    rng = np.random.default_rng([seed, SETS.index(half), index])
+    programs = programs_of(half, index)
     voice = str(rng.choice(sorted(voices)))
     scene = draw_scene(rng, read_reference(rng, voices[voice]), rng.uniform(*ROBOT_OVER_FAN_DB))
     usual = scene.record(scene.usual)
     for _ in range(TRIES):
-        chain, words = through(rng, scene, program)
-        mic = scene.record(chain)
-        change = put_back(mic, usual) - usual
-        change_db = scene.over_fan_db(change)
-        if program is CONTROL or change_db >= LEAST_DB:
+        mic, said, least = hidden(rng, scene, programs)
+        if least >= LEAST_DB:
             break
-    right = program.right
-    if program is not CONTROL and change_db >= LEAST_DB and is_a_volume(scene, change):
-        right = (*right, "playback_gain")
-    strength = "control" if program is CONTROL else "clear" if change_db >= CLEAR_DB else "moderate"
-    truth = {"effects": [right[0]], "also": list(right[1:]), "raw": [program.name], "strength": strength}
-    truth |= {"setting": words, "effect_to_noise_db": change_db, "tolerances": scene.tolerances}
+    change = put_back(mic, usual) - usual
+    change_db = scene.over_fan_db(change)
+    right = [program.right[0] for program in programs] or ["none"]
+    also = [name for program in programs for name in program.right[1:]]
+    if len(programs) == 1 and change_db >= LEAST_DB and is_a_volume(scene, change):
+        also.append("playback_gain")
+    strength = "clear" if change_db >= CLEAR_DB else "moderate"
+    truth = {"effects": right, "also": also, "raw": [program.name for program in programs] or ["none"]}
+    truth |= {"strength": strength if programs else "control", "setting": "; ".join(said)}
+    truth |= {"effect_to_noise_db": change_db, "tolerances": scene.tolerances}
     truth |= {"robot_over_fan_db": decibels(power(scene.echo(scene.usual)) / scene.fan_power)}
     return scale(scene.signals | {"mic": mic}, {}), truth | {"voice": voice, "seed": [seed, index]}
 
@@ -524,7 +554,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--voices", type=Path, required=True, nargs="+", metavar="DIR", help="the robot's voices")
     parser.add_argument("--output", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--half", choices=sorted(HALVES), required=True)
+    parser.add_argument("--half", choices=SETS, required=True)
     parser.add_argument("--count", type=int, default=40, help="cases (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()

@@ -88,15 +88,16 @@ def test_cases_are_counted_by_strength_and_kind() -> None:
         "among the first two, near": (0, 1),
         "that effect and no other": (1, 3),
         "nothing: false alarms": (1, 2),
-        "two effects: both named": (1, 1),
+        "several effects: all named": (1, 1),
+        "all of their families named": (1, 1),
         "at least one named": (1, 1),
-        "both and no other": (0, 1),
+        "all and no other": (0, 1),
         "outside the catalogue: unexplained": (1, 3),
         "explained above 1 dB of excess": (1, 3),
     }
     counts, effects, misses = names.tables({"made": cases, "again": cases[-1:]})[:3]
     rows = {row[0]: row[1:] for row in counts["rows"]}
-    assert rows["two effects: both named"] == ["1 of 1, 100 [21, 100] %"] * 2
+    assert rows["several effects: all named"] == ["1 of 1, 100 [21, 100] %"] * 2
     assert rows["nothing: false alarms"] == ["1 of 2, 50 [9, 91] %", None]
     assert effects["rows"][1] == ["rattle", "1 of 2", 5.0, 0.2, 0.2, 90.0]
     assert (

@@ -33,9 +33,16 @@ def test_every_right_name_is_one_that_the_diagnosis_may_say(half: str) -> None:
 @pytest.mark.parametrize("half", sorted(wild.HALVES))
 def test_programs_come_in_turn_with_a_control_for_every_ten(half: str) -> None:
     programs = wild.HALVES[half]
-    drawn = [wild.program_of(half, index) for index in range(2 * len(programs))]
-    assert [program for program in drawn if program is not wild.CONTROL][: len(programs)] == list(programs)
-    assert [index for index, program in enumerate(drawn) if program is wild.CONTROL] == list(range(9, len(drawn), 10))
+    drawn = [wild.programs_of(half, index) for index in range(2 * len(programs))]
+    assert [program for of in drawn for program in of][: len(programs)] == list(programs)
+    assert [index for index, of in enumerate(drawn) if not of] == list(range(9, len(drawn), 10))
+
+
+def test_what_is_combined_has_one_right_name_each() -> None:
+    drawn = [of for index in range(20) if (of := wild.programs_of("combined", index))]
+    assert [tuple(program.name for program in of) for of in drawn[: len(wild.COMBINED)]] == list(wild.COMBINED)
+    assert all(len({program.right for program in of}) == len(of) for of in drawn)
+    assert all(len(program.right) == 1 for of in drawn for program in of)
 
 
 @pytest.mark.parametrize("lag", [0, 37, 480, -20])
