@@ -52,8 +52,9 @@ def variance_at(hz: Array, psd: Samples) -> Array:
 
 def coloured(rng: np.random.Generator, size: int, psd: Samples) -> Array:
     """Gaussian noise of that PSD (bins,), (size,)."""
-    amplitude = np.sqrt(variance_at(np.fft.rfftfreq(size, 1 / SAMPLE_RATE), psd))
-    return np.fft.irfft(np.fft.rfft(rng.standard_normal(size)) * amplitude, size)
+    fast = fft.next_fast_len(size, real=True)
+    amplitude = np.sqrt(variance_at(fft.rfftfreq(fast, 1 / SAMPLE_RATE), psd))
+    return fft.irfft(fft.rfft(rng.standard_normal(fast)) * amplitude, fast)[:size]
 
 
 def total_power(psd: Samples) -> float:

@@ -8,7 +8,7 @@ import pytest
 from edgefilter import PathLearner, Profile
 from edgefilter.echo.model import EchoModel
 from edgefilter.filter.echo_path import FilteredHop, starting_path
-from edgefilter.types import SAMPLE_RATE
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE
 from tests.learning.scenes import Scene, db, room, run
 
 HOP = 256
@@ -59,10 +59,16 @@ def test_what_no_later_hop_has_confirmed_is_not_kept(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_filter_that_begins_with_a_learned_path_leaves_it_sooner_than_a_measured_one(tmp_path):
+def test_what_is_kept_is_the_room_and_its_fan_and_is_left_sooner_than_what_was_measured(tmp_path):
     _, _, ego = run(Scene(moved=23, seconds=24.0).part(12.0, 20.0), PathLearner(None, tmp_path / "robot.npz"))
     ego.close()
     learned = Profile.load(tmp_path / "robot.npz")
+    path, true = learned.echo.impulse_response[PRE_ROLL:], room(23)
+    assert db(path[: true.size] - true) < db(true) - 20.0  # of a loudspeaker that distorts by -20 dB
+    assert dict(learned.echo.effects).keys() == {"speaker_nonlinearity"}
+    fan = 10 * np.log10(learned.noise_psd / (1e-8 / 8000))
+    assert abs(np.median(fan)) < 1.0 and np.abs(np.percentile(fan, [5, 95])).max() < 3.0
+    assert 40.0 < learned.band_snr_db.min() and learned.band_snr_db.max() < 75.0
     elsewhere = Scene(seconds=8.5)  # a path that fits nowhere is given up once all lags were searched
     last = [run(elsewhere, profile=p)[0][-SAMPLE_RATE:] for p in (learned, replace(learned, source="a sweep"))]
     assert db(last[0]) < db(last[1]) - 3.0
