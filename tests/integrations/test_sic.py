@@ -115,8 +115,9 @@ def test_the_four_microphones_of_a_robot_s_head_are_one_array(cloud, room_of):
 def check(sound, told, room_of):
     """The room's human begins after 3 s, 23 dB below the robot, who talks until 5.7 s."""
     assert sound.size > 5.5 * RATE
-    (began,) = (seconds for _, seconds, speaks, _ in told if speaks)
-    assert 3.0 < began < 3.6, told
+    began = [seconds for _, seconds, speaks, _ in told if speaks]
+    # a busy machine steps down to an engine that may hear him begin again behind a pause
+    assert began and 3.0 < began[0] < 3.6, told
     both = slice(3 * RATE, round(5.4 * RATE))
     human = room_of.HUMAN[: both.stop - both.start]
     assert max(si_sdr(sound[both], np.roll(human, shift)) for shift in (0, 1)) > 3  # before: -23 dB
