@@ -48,13 +48,14 @@ def named_numbers(body: Sequence[ast.stmt], field: bool = False) -> int:
     for statement in body:
         if isinstance(statement, ast.ClassDef):
             count += named_numbers(statement.body, True)
-        elif isinstance(statement, (ast.Assign, ast.AnnAssign)) and statement.value and _holds_number(statement.value):
+        elif isinstance(statement, (ast.Assign, ast.AnnAssign)) and statement.value and holds_number(statement.value):
             targets = statement.targets if isinstance(statement, ast.Assign) else [statement.target]
             names = (node.id for target in targets for node in ast.walk(target) if isinstance(node, ast.Name))
             count += sum(name.isupper() or (field and isinstance(statement, ast.AnnAssign)) for name in names)
     return count
 
 
-def _holds_number(value: ast.expr) -> bool:
+def holds_number(value: ast.expr) -> bool:
+    """Whether a value is a number, or has one in it."""
     constants = (node.value for node in ast.walk(value) if isinstance(node, ast.Constant))
     return any(isinstance(constant, (int, float)) and not isinstance(constant, bool) for constant in constants)

@@ -8,7 +8,8 @@ nothing while a program runs, are left out. The tests of a mutant are those of t
 tests/bench that have the name of one of its modules, that reach the line, measured once without a mutant; all of them
 where none reaches it, as on import or in a child process. It is killed where one fails, or where they take longer
 than three times what all of them take; slow tests come last. Everything happens in copies of the checkout. Outcomes
-are kept in --cache by code and tests. The same seed draws the same mutants as long as the code is the same: `--again`
+are kept in --cache by code and tests. `--numbers` doubles and halves numbers that have a name instead: one that no test
+tells from either decides nothing that is tested. The same seed draws the same mutants as long as the code is the same: `--again`
 tries those alone that survived in OUTPUT.json, after tests were added.
 """
 
@@ -25,24 +26,29 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 from bench import provenance, results
 from bench.cache import Cache, key_of
+from bench.count import holds_number, named_numbers
 from bench.metrics import counted
 from bench.recordings import progress
 from edgefilter.errors import UsageError
 
+Places: TypeAlias = dict[tuple[int, int], list[tuple[str, int]]]
 FOLDERS = ("alignment", "filter", "engines", "learning", "diagnosis", "integrations")
 LEFT_OUT = ("results", "__pycache__", "*.egg-info", ".*")
 PATIENCE, LEAST_S = 3.0, 60.0
 """A mutant is killed by the clock after so many times what the tests take without one, but not before LEAST_S."""
 PASSED, FAILED, NONE_CHOSEN = 0, 1, 5
 """Exit codes of pytest."""
+SCALED = {"double": "({} * 2)", "halve": "(lambda x: type(x)(x / 2))({})"}
+"""What stands in place of a number that has a name; half of an integer is one."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--modules", default=",".join(FOLDERS), metavar="A,B,...", help="folders (default: %(default)s)")
     add("--count", type=int, default=200, help="mutants (default: %(default)s)")
+    add("--numbers", action="store_true", help="double and halve numbers that have a name")
     add("--again", action="store_true", help="only those that survived in OUTPUT.json")
 
 
@@ -72,7 +79,7 @@ def run(options: argparse.Namespace) -> str:
             if not place.is_dir():
                 raise UsageError(f"there is no {place}, expected folders of edgefilter/ that tests/ has as well")
     made_with = provenance.stamp()
-    drawn = sample(folders, options.count, options.seed)
+    drawn = sample(folders, options.count, options.seed, numbers if options.numbers else places)
     outcomes = _survived(options.output, drawn) if options.again else {}
     missing = [mutant for mutant in drawn if outcomes.get(mutant, "survived") == "survived"]
     cache, code = Cache(options.cache, "mutants"), {folder: code_of(folder) for folder in folders}
@@ -115,13 +122,14 @@ def _survived(output: Path | None, drawn: Sequence[Mutant]) -> dict[Mutant, str]
     return known
 
 
-def sample(folders: Sequence[str], count: int, seed: int) -> list[Mutant]:
-    """So many different places of the folders' modules, each with a replacement drawn at random."""
-    cosmic = _cosmic_ray()
+def sample(
+    folders: Sequence[str], count: int, seed: int, places_of: Callable[[str], Places] | None = None
+) -> list[Mutant]:
+    """So many different places of the folders' modules, each with a replacement drawn at random. places_of: `places` or `numbers`."""
     found: dict[tuple, list[tuple[str, int]]] = {}
     for folder in folders:
         for path in sorted((results.ROOT / "edgefilter" / folder).rglob("*.py")):
-            for place, replacements in places(cosmic, path.read_text(encoding="utf-8")).items():
+            for place, replacements in (places_of or places)(path.read_text(encoding="utf-8")).items():
                 found[(folder, path, *place)] = replacements
     rng = random.Random(seed)
     mutants = []
@@ -141,10 +149,11 @@ def sample(folders: Sequence[str], count: int, seed: int) -> list[Mutant]:
     return mutants
 
 
-def places(cosmic: object, source: str) -> dict[tuple[int, int], list[tuple[str, int]]]:
+def places(source: str) -> Places:
     """Every (line, column) of the source that can be mutated, with the operators and occurrences there."""
+    cosmic = _cosmic_ray()
     nodes, skipped = list(cosmic.ast.ast_nodes(cosmic.ast.get_ast(source))), list(annotations(source))
-    found: dict[tuple[int, int], list[tuple[str, int]]] = {}
+    found: Places = {}
     for name in cosmic.plugins.operator_names():
         operator = cosmic.plugins.get_operator(name)
         if operator.arguments():  # those that replace one named variable
@@ -156,6 +165,30 @@ def places(cosmic: object, source: str) -> dict[tuple[int, int], list[tuple[str,
     return dict(sorted(found.items()))
 
 
+def numbers(source: str) -> Places:
+    r"""Every (line, column) at which a number that has a name stands; of several in one tuple each, of one that is worked out the whole.
+
+    >>> list(numbers("A, B = 1, 0.5 * 16000\nC = 'no number'"))
+    [(1, 7), (1, 10)]
+    """
+    return {
+        (at.lineno, at.col_offset): [(name, i) for name in SCALED]
+        for i, at in enumerate(_numbers(ast.parse(source).body))
+    }
+
+
+def _numbers(body: Sequence[ast.stmt]) -> Iterator[ast.expr]:
+    plain = (ast.Constant, ast.BinOp, ast.UnaryOp, ast.Name, ast.operator, ast.unaryop, ast.expr_context)
+    for statement in body:
+        if isinstance(statement, ast.ClassDef):
+            yield from _numbers(statement.body)
+        elif named_numbers([statement], field=True):
+            value = statement.value
+            for one in value.elts if isinstance(value, ast.Tuple) else [value]:
+                if holds_number(one) and all(isinstance(node, plain) for node in ast.walk(one)):
+                    yield one
+
+
 def annotations(source: str) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
     for node in ast.walk(ast.parse(source)):
         for part in (getattr(node, "annotation", None), getattr(node, "returns", None)):
@@ -164,6 +197,13 @@ def annotations(source: str) -> Iterator[tuple[tuple[int, int], tuple[int, int]]
 
 
 def mutated(source: str, operator: str, occurrence: int) -> str:
+    if operator in SCALED:
+        at = list(_numbers(ast.parse(source).body))[occurrence]
+        lines = source.splitlines(keepends=True)
+        before, after = lines[at.lineno - 1], lines[at.end_lineno - 1]
+        number = SCALED[operator].format(ast.get_source_segment(source, at))
+        rest = before[: at.col_offset] + number + after[at.end_col_offset :]
+        return "".join([*lines[: at.lineno - 1], rest, *lines[at.end_lineno :]])
     cosmic = _cosmic_ray()
     return cosmic.mutating.mutate_code(source, cosmic.plugins.get_operator(operator)(), occurrence)
 

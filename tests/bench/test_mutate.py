@@ -59,6 +59,20 @@ def test_annotations_are_no_places(checkout: Path) -> None:
     )
 
 
+def test_numbers_that_have_a_name_are_doubled_and_halved() -> None:
+    source = "A, B = 3, 0.5 * 4\n\n\nclass Settings:\n    wait_s: float = 0.5\n    name: str = 'one'\n"
+    assert [at for at, of in mutate.numbers(source).items() if of] == [(1, 7), (1, 10), (5, 20)]
+    found = {}
+    for operator in mutate.SCALED:
+        for occurrence in range(3):
+            exec(mutate.mutated(source, operator, occurrence), names := {})
+            found[operator, occurrence] = (names["A"], names["B"], names["Settings"].wait_s)
+    assert found == {
+        ("double", 0): (6, 2.0, 0.5), ("double", 1): (3, 4.0, 0.5), ("double", 2): (3, 2.0, 1.0),
+        ("halve", 0): (1, 2.0, 0.5), ("halve", 1): (3, 1.0, 0.5), ("halve", 2): (3, 2.0, 0.25),
+    }  # fmt: skip
+
+
 @pytest.mark.slow
 def test_what_a_test_notices_is_killed_and_what_none_does_survives(
     checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
