@@ -17,7 +17,7 @@ from edgefilter.dsp.frames import decibels, frames
 from edgefilter.dsp.psd import GRID_BINS, ROUNDING_PSD, coloured, floored, frequencies, hann, variance_at
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.echo.least_squares import normal_equations
-from edgefilter.echo.measurement import Measurement
+from edgefilter.echo.measurement import Measurement, level_ratio
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.recording import BLOCK
 from edgefilter.echo.wiener import convolve_from
@@ -157,8 +157,8 @@ class Straightened:
         read = frames(residual, FRAME, 1)[at] * _window()
         return _by_band(fourier.power(fft.rfft(read, axis=-1)).mean(axis=1) / self._fan_bins)
 
-    def of(self, model: EchoModel) -> Score:
-        """The score of what a model predicts, in the noise that it expects.
+    def of(self, model: EchoModel, any_volume: bool = False) -> Score:
+        """The score of what a model predicts, in the noise that it expects. any_volume: of the voice at the volume that explains most.
 
         That is the fan, as what is at the microphone lets it through, and what no waveform predicts. The ordinary
         tolerances are taken up first. A gain of the microphone, which the fan passed as well, is taken out of the residual
@@ -167,7 +167,11 @@ class Straightened:
         """
         here = self.behind(model)
         measurement, reference = here.measurement, here.measurement.reference
-        corrected = here.correct(*measurement.predicted(model))
+        voice, white = measurement.predicted(model)
+        if any_volume:
+            volume = np.float32(level_ratio(measurement.white_recording * measurement.weights, white * measurement.weights))
+            voice, white = volume * voice, volume * white
+        corrected = here.correct(voice, white)
         unpredictable = model.unpredictable(reference)
         passed, gain = model.passed(here._fan, reference), model.microphone_gain(self.usable.size)
         residual = measurement.recording - corrected

@@ -196,7 +196,12 @@ class Workbench:
             return None
         if vanishes(effect, values) and name not in dict(model.effects):
             return None
-        return self.beside(name, model, model.with_effect(name, values))
+        trial = self.beside(name, model, model.with_effect(name, values))
+        if effect.family != "time":
+            return trial
+        # what a lag explains at the wrong volume is no measure of it: any filter that mutes the voice would explain more
+        before, after = (self.recording.of(each, any_volume=True).level_db for each in (model, trial.model))
+        return replace(trial, gain_db=max(trial.gain_db, before - after))
 
     def beside(self, name: str, others: EchoModel, model: EchoModel) -> Trial:
         """What the effect of that name explains that model has and others has not."""
