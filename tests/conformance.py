@@ -452,6 +452,7 @@ EFFECT_CASES: dict[str, dict[str, object]] = {
     "free_curve": BENT,
     "free_curve_behind": BENT,
     "free_filter": {"taps": np.eye(256)[[32, 75]].T @ [-0.3, 0.6]},
+    "free_filter_ahead": {"taps": np.eye(128)[[32, 75]].T @ [-0.3, 0.6]},
     "free_modulation": {"rate_hz": 4.0, "waves": np.eye(8)[[0, 5]].T @ [0.5, 0.2]},
     "free_lag": {"lag": 1.5 * np.sin(np.arange(SECONDS + 1.0))},
     "bandlimit": {"cutoff_hz": 2500.0, "order": 6.0},

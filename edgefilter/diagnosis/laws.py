@@ -9,7 +9,7 @@ import numpy as np
 
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.ordinary import p_value
-from edgefilter.diagnosis.trials import Found, Reading, Trial, added
+from edgefilter.diagnosis.trials import AHEAD, Found, Reading, Trial, added
 from edgefilter.echo.effect import vanishes
 from edgefilter.echo.effects.catalogue import EFFECTS, find
 from edgefilter.echo.effects.free_laws import FreeLaw
@@ -153,7 +153,7 @@ def _trials(found: Found, progress: Callable[[str], None] | None, without: Colle
     """Each law beside all names, and in place of those of its family; how much more it explains than all names."""
     names = tuple(step.name for step in found.steps)
     for effect in EFFECTS:
-        if not effect.free or effect.name in {*without, *dict(found.model.effects)}:
+        if not effect.free or effect.name in {AHEAD, *without, *dict(found.model.effects)}:
             continue
         if progress:
             progress(f"trying {effect.title}")

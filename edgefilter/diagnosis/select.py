@@ -33,7 +33,10 @@ def search(
     steps = _in_steps(bench, model, best)
     full = len(steps) >= criteria.most_effects and not bench.explained(best)
     notes = (*bench.notes, FULL.format(criteria.most_effects)) if full else bench.notes
-    return Found(recording, model, best, bench.score(model), bench.score(best), steps, notes, bench.tried(model, best))
+    like = {step.name: reading for step in steps if find(step.name).free and (reading := bench.known_by(step))}
+    return Found(
+        recording, model, best, bench.score(model), bench.score(best), steps, notes, bench.tried(model, best), like
+    )
 
 
 def _stepwise(bench: Workbench, start: EchoModel) -> Iterator[EchoModel]:

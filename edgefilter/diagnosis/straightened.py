@@ -169,7 +169,9 @@ class Straightened:
         measurement, reference = here.measurement, here.measurement.reference
         voice, white = measurement.predicted(model)
         if any_volume:
-            volume = np.float32(level_ratio(measurement.white_recording * measurement.weights, white * measurement.weights))
+            volume = np.float32(
+                level_ratio(measurement.white_recording * measurement.weights, white * measurement.weights)
+            )
             voice, white = volume * voice, volume * white
         corrected = here.correct(voice, white)
         unpredictable = model.unpredictable(reference)

@@ -13,11 +13,13 @@ from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.ordinary import p_value
 from edgefilter.diagnosis.straightened import Score, Straightened, share_of
 from edgefilter.echo.effect import vanishes
-from edgefilter.echo.effects.catalogue import find, names
+from edgefilter.echo.effects.catalogue import EFFECTS, find, names
 from edgefilter.echo.measurement import STEADY_DB, Values
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import UsageError
 
+AHEAD = next(one.name for one in EFFECTS if one.free and one.family == "linear path" and one.stage == "source")
+"""A filter ahead of what bends the voice. Alone it is the one behind, so it is tried beside that only."""
 Signature: TypeAlias = tuple[tuple[str | bytes, ...], ...]
 
 
@@ -215,14 +217,42 @@ class Workbench:
     def attempt_all(self, model: EchoModel, most: int = 9) -> list[Trial]:
         """Each effect that the model has not and whose complexity is at most `most`.
 
-        The last resorts only where none of the others explains a good part of what is left.
+        Where none of them explains a good part of what is left, those that bend the voice behind a filter; the
+        last resorts only where none of these does either.
         """
         absent = self.absent(model, most)
         found = self._attempt_in_turn([name for name in absent if not find(name).last_resort], model)
         if self.little(model) or any(self.worth(trial, model) for trial in found):
             return found
+        if moved := self.filtered_ahead(model):
+            instead = Trial.of(AHEAD, moved, self.score(model), self.score(moved))
+            if self.worth(instead, model):
+                return [instead]
+            bends = [name for name in absent if find(name).learned]
+            behind = [trial for name in bends if (trial := self.attempt(name, moved)) is not None]
+            if any(self.worth(trial, moved) for trial in behind):
+                return behind
         resorts = (self.attempt(name, model) for name in absent if find(name).last_resort)
         return found + [trial for trial in resorts if trial is not None]
+
+    def filtered_ahead(self, model: EchoModel) -> EchoModel | None:
+        """The model with one filter ahead of the loudspeaker in place of those on its path; None where it has none."""
+        others = model
+        for name in added(self._start, model):
+            if find(name).stage == "path" and find(name).absorbed:
+                others = self.less(others, name)
+        ahead = None if others is model else self.attempt(AHEAD, others)
+        return ahead.model if ahead else None
+
+    def known_by(self, law: Trial) -> Reading | None:
+        """The listed filter on the path that explains most of what a law's filter does by itself."""
+        start = self._start
+        listed = [one for one in names() if find(one).stage == "path" and find(one).absorbed and not find(one).free]
+        best = max(
+            (fit for one in listed if (fit := self.attempt(one, start))), key=lambda fit: fit.gain_db, default=None
+        )
+        alone = self.beside(law.name, start, start.with_effect(law.name, law.values))
+        return Reading(best.name, min(best.gain_db / alone.gain_db, 1.0)) if best and alone.gain_db > 0.0 else None
 
     def _attempt_in_turn(self, names: list[str], model: EchoModel) -> list[Trial]:
         """The simple ones first; the richer ones where none of those explains so much that no other could be preferred to it."""
@@ -251,7 +281,7 @@ class Workbench:
 
     def tried(self, start: EchoModel, model: EchoModel) -> tuple[Tried, ...]:
         """All effects that were fitted, beside the start or elsewhere, with what came of them, and those that were spared; nothing is fitted anew."""
-        names_tried = {name: None for _, name in self._trials}
+        names_tried = {name: None for _, name in self._trials if not find(name).free}
         found = []
         for name in names_tried:
             alone = self._trials.get((signature(start), name))

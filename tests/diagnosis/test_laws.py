@@ -244,3 +244,17 @@ def test_a_curve_is_written_with_as_many_digits_as_mean_something() -> None:
     assert curve.to_dict() == {
         **{"name": "gain by level", "x_unit": "dB", "x": [0.333], "y_db": [0.67], "share": 0.1429, "y_unit": "dB"}
     }
+
+
+@pytest.mark.slow
+def test_an_equaliser_ahead_of_what_bends_the_voice_is_told_from_one_behind() -> None:
+    x = voice(8.0)
+    bell, high = (
+        signal.lfilter(*signal.butter(1, band, "band", fs=SAMPLE_RATE), x) for band in ((700, 1400), (2500, 5000))
+    )
+    coloured = x + 2.0 * bell - 0.6 * high
+    peak = np.abs(coloured).max() / 3.0
+    found = diagnose(profile(), record((peak * np.tanh(coloured / peak)).astype(np.float32)), x)
+    assert [finding.name for finding in found.ranking] == ["equaliser", "speaker_nonlinearity"]
+    assert found.ranking[0].effect == "free_filter_ahead" and found.ranking[0].like.share > 0.9
+    assert found.comparison.excess_db > 20.0 and found.remaining_db < 1.0  # with the equaliser behind: 15

@@ -23,6 +23,7 @@ from edgefilter.echo.effects.free_laws import (
     FreeCurve,
     FreeCurveBehind,
     FreeFilter,
+    FreeFilterAhead,
     FreeGain,
     FreeGainBehind,
     FreeLag,
@@ -44,6 +45,7 @@ from edgefilter.errors import UsageError
 from edgefilter.types import Array
 
 EFFECTS: tuple[Effect, ...] = (
+    FreeFilterAhead(),
     PlaybackGain(),
     Compression(),
     MultibandCompression(),

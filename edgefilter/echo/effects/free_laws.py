@@ -43,6 +43,10 @@ RATES_PER_CYCLE = 24
 HARMONICS = 4
 TAPS, LEAD = 256, 32
 """Of the filter: an echo of 14 ms; longer ones are listed."""
+AHEAD_TAPS = 128
+"""Of the filter ahead: 8 ms, as far as an equaliser reaches that is not narrow; each costs a prediction a step."""
+LEARNT_FROM, NUDGE = 5 * SAMPLE_RATE, 0.01
+"""Samples that a Gauss-Newton step looks at, and the change of a tap by which its effect is told."""
 LAG_STEP = 1600
 """Samples (100 ms) in which a lag is one number; its curve has a knot a second, so that blocks of half a second that no fit has used
 lie between two."""
@@ -306,6 +310,44 @@ class FreeFilter(FreeLaw):
             f"a filter of {1000 * TAPS // SAMPLE_RATE} ms, {gain_db[high]:+.1f} dB at {hz[high]:.0f} Hz and {gain_db[low]:+.1f}"
             f" dB at {hz[low]:.0f} Hz"
         )
+
+
+class FreeFilterAhead(FreeFilter):
+    """The same ahead of what bends the voice, as a player's equaliser is; alone it is the one behind."""
+
+    name = "free_filter_ahead"
+    stage = "source"
+    title = "a filter ahead of the loudspeaker"
+    memory = AHEAD_TAPS
+
+    def fitted(self, ground: _Ground) -> Values:
+        """As if the rest were linear, whose filter is in proportion to it (Bussgang 1952), then by a Gauss-Newton step."""
+        taps = fit_filter(ground.heard, ground.target - ground.heard, ground.weights, AHEAD_TAPS, LEAD)
+        plain, louder = ground.heard, ground.part(2.0 * ground.x)
+        if float(np.sum((louder - 2.0 * plain) ** 2)) > 1e-4 * float(np.sum(plain**2)):
+            taps = _closer(ground, taps)
+        return {"taps": taps}
+
+
+def _closer(ground: _Ground, taps: Array) -> Array:
+    """The taps of a filter ahead after a step towards the recording, halved as long as it leaves more; (taps,)."""
+    start = int(np.argmax(block_sums(np.square(ground.heard * ground.weights), LEARNT_FROM)))
+    part = slice(start * LEARNT_FROM, (start + 1) * LEARNT_FROM)
+    x, weights = ground.x[part], ground.weights[part].copy()
+    weights[: SAMPLE_RATE // 2] = 0.0  # in it what was before is missing
+
+    def heard(taps: Array) -> Samples:
+        return ground.part(x + filtered(x, taps, LEAD))
+
+    now, rows = heard(taps), np.empty((taps.size, x.size), np.float32)
+    for row, nudge in zip(rows, NUDGE * np.eye(taps.size), strict=True):
+        row[:] = (heard(taps + nudge) - now) * (weights / NUDGE)
+    left = (ground.target[part] - now) * weights
+    normal = (rows @ rows.T).astype(float)
+    normal += (1e-4 * np.trace(normal) / taps.size + 1e-30) * np.eye(taps.size)
+    step = np.linalg.solve(normal, (rows @ left).astype(float))
+    tried = [taps + share * step for share in (1.0, 0.5, 0.25, 0.0)]
+    return min(tried, key=lambda taps: float(np.sum(((ground.target[part] - heard(taps)) * weights) ** 2)))
 
 
 class FreeModulation(FreeLaw):
