@@ -287,7 +287,7 @@ class FreeFilter(FreeLaw):
     """One more filter behind the path."""
 
     name = "free_filter"
-    stage = "path"
+    stage: ClassVar[Stage] = "path"
     family = "linear path"
     title = "a filter"
     parameters = (Parameter("taps", "1", 0.0, -10.0, 10.0),)  # of what is added, from LEAD before the voice itself on
