@@ -7,7 +7,7 @@ are right (also; a volume, where at its setting the program does no more), which
 programs come in turn, every tenth case is a control; a setting is drawn again, at most six times, while it changes less
 than LEAST_DB over the fan. Robot, room and tolerances are those of hidden_robot. The halves `reporting` and `unseen` are
 for figures, never for tuning: no two halves share a suite. `combined` hides two or three effects at once, by programs of `tuning`
-and a fan that has changed; each changes LEAST_DB beside those before it.
+and a fan that has changed; each changes the recording by LEAST_DB or more, behind those before it.
 
 Debian: sox ffmpeg swh-plugins tap-plugins cmt caps invada-studio-plugins-ladspa zam-plugins vlevel lame opus-tools speex
 libgsm-tools fil-plugins rev-plugins guitarix-ladspa blop vorbis-tools dpf-plugins-ladspa. PyPI: pedalboard noisereduce webrtc-noise-gain.
@@ -66,10 +66,10 @@ class Command:
 
 @dataclass(frozen=True)
 class Program:
-    """One effect of one program: where it stands, the names that are right, and a setting drawn at random.
+    """One effect of one program: its place in the signal chain, the names that are right, and a setting drawn at random.
 
     right: the first is what the manual says that the effect does, others that are right as well stand behind it. draw:
-    None for a simulator of rooms, which is given the room itself, and for the fan's own of hidden_effects.
+    None for a simulator of rooms, which is given the room itself, and for the changed fan of hidden_effects.
     """
 
     name: str
@@ -490,7 +490,7 @@ def moved(rng: Rng, place: Place, program: Program) -> tuple[Place, str]:
 
 
 def through(rng: Rng, scene: Scene, chain: Chain, program: Program) -> tuple[Chain, str]:
-    """The chain with a setting of the program in its place, and the words for that setting."""
+    """The chain with the program inserted at its place, at a setting drawn at random, and the words for that setting."""
     if program is FAN:
         changed, setting = fan_noise(rng, scene, chain, "clear")
         return changed, f"fan {setting['kind']}, {setting['change_db']:.1f} dB"

@@ -26,7 +26,8 @@ LIKELY_LAG_S = 2.0
 LATE = SAMPLE_RATE // 10
 """Samples by which a reference may come after its echo and is still found for an utterance; with LATEST they are found .15 s later."""
 LATEST = SAMPLE_RATE
-"""The same for a look that supposes nothing. It hears twice as many at most, so that half is left then."""
+"""The same in a search of all lags that supposes no beginning of an utterance. Its window is twice as long, so that half of it is left at
+this lateness."""
 LOOKS, FIRST_LOOK = 12, SAMPLE_RATE // 2
 """Looks that are remembered, and samples of an utterance after which there is one: then one every LATEST, and one at each realignment.
 Speech that begins while the reference is silent waits for as long until it is nobody's but a human's: the reference may follow."""
@@ -56,17 +57,18 @@ class Aligned(NamedTuple):
     """The reference as an aligner delivers it for one hop of the microphone.
 
     reference: (hop,) float32, delayed so that the robot's direct sound lies PRE_ROLL samples behind it; zeros while no
-    delay is known. delay: samples, of the direct sound at the end of the hop, nan if unknown. ppm: by how much it shrinks,
+    delay is known. delay: samples, of the direct sound at the end of the hop, nan if unknown. ppm: by how much the delay shrinks,
     1e-6 samples per sample. confidence: probability that the delay is right, 0 to 1. realigned: the delay was switched
     discontinuously in this hop. state: of the utterance that may be heard now. "idle": nothing of the reference can be
     audible. "announced": it is waited for, and may begin at any time or never. "begun": it has begun and is not found yet;
     delay is the one of before, or nan. "unfound": as "begun", but it should have been heard by now, whatever its lag.
-    "coarse": no sharp arrival was found yet, the delay is known to within 25 ms; the reference is early by as much. "lost":
+    "coarse": no sharp arrival was found yet, the delay is known to within 25 ms; the reference is read 25 ms early. "lost":
     it was found, but the last looks did not see it, beside a loud human or after a jump; delay is carried on, with its
     drift. "locked": its delay is followed. at_any_lag: what is heard may be an utterance at a lag that nobody knows: it was
     not found so far, and no delay is known, or the one of before was refuted; of a calibrated robot, it is too loud for
     anybody else (FirstSounds). wait: samples by which the microphone must be delayed to fit the reference, WAIT at most.
-    past: what was heard so far. belief: what the latest looks say together, in a hop in which one was taken.
+    past: the last seconds of both channels. belief: probabilities of the lags
+    after the latest searches, in a hop in which one of them has ended; else None.
     """
 
     reference: Samples
@@ -193,7 +195,7 @@ class Aligner:
         return aligned._replace(past=past, belief=self._believe(aligned))
 
     def _believe(self, aligned: Aligned) -> Belief | None:
-        """What is believed where a look has seen something, or a lag is followed and it is time for a look."""
+        """Probabilities of the lags after one more search, or after a second of following a lag; None in other hops."""
         seen, self._seen, now = self._seen, None, self._ref.end
         if self._follows(aligned.state):
             if not aligned.realigned and now < self._next_look:
@@ -208,7 +210,7 @@ class Aligner:
         return self._belief
 
     def _follows(self, state: AlignmentState) -> bool:
-        """Whether the lag that is followed counts as a look: not one that was found while the reference was late."""
+        """Whether the lag that is followed counts as the result of a search: not if the reference came after its echo when it was found."""
         return state in ("locked", "coarse") and not (self._belief.late[-1:] > 0.5).any()
 
     def _look_coarsely(self, mic: Samples, ref: Samples, by_bands: CoarseLag) -> bool:
@@ -309,9 +311,11 @@ class Aligner:
         yield False
         self._lags.listen({0: self._mics[self._used[0]]}, self._ref.end, self._looked)
         yield False
-        # a silent microphone does not show the robot either
+        # in a silent microphone the robot is not heard: a search without a result
         self._seen = self._lags.find() or Found(0, 0.0, self._ref.end)
-        self._looked = self._ref.end + min(self._seen.lag, 0)  # at that lag the next look hears what this one did not
+        self._looked = self._ref.end + min(
+            self._seen.lag, 0
+        )  # so that the next search uses sound that this one has not used
         sure = self._seen.lag >= -WAIT and self._seen.odds > CERTAIN
         yield sure and bool(self._open) and not self._known and self._take(self._seen)
 
@@ -445,7 +449,9 @@ class Aligner:
         if self._gain is not None and self._lost >= LOST_BLOCKS:
             self._lost = 0
             self._open.append(Utterance(self._ref.end, self._ref.end, nearby=NEARBY_SEARCHES, lost=True))
-        elif self._gain is None and self._log_odds < 0.0:  # what no look has ever seen may be wrong from the start
+        elif (
+            self._gain is None and self._log_odds < 0.0
+        ):  # a lag that no measurement has ever confirmed may be wrong from the start
             self._open.append(Utterance(self._onsets.current.start, self._onsets.current.end, lost=True))
         self._trusted = self._trusted and not self._open
 
@@ -469,7 +475,7 @@ class Aligner:
         begun = self._known and self._open and (not self._open[0].lost or self._belief.lost)
         if begun and self._gain is not None and end - delay > self._open[0].start:
             brought = self._ref.read(end - round(delay) - self.hop, end - round(delay))
-            heard = float(np.dot(mic, mic))  # 10 dB less than the reference at that delay would bring there?
+            heard = float(np.dot(mic, mic))  # is that 10 dB below the echo of the reference at that delay?
             self._refuted = self._refuted or heard < 0.1 * self._gain * float(np.dot(brought, brought))
         if self._refuted:
             reference = np.zeros(self.hop, np.float32)

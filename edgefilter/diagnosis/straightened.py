@@ -158,7 +158,7 @@ class Straightened:
         return _by_band(fourier.power(fft.rfft(read, axis=-1)).mean(axis=1) / self._fan_bins)
 
     def of(self, model: EchoModel, any_volume: bool = False) -> Score:
-        """The score of what a model predicts, in the noise that it expects. any_volume: of the voice at the volume that explains most.
+        """The score of what a model predicts, in the noise that it expects. any_volume: with the voice at the volume that fits best.
 
         That is the fan, as what is at the microphone lets it through, and what no waveform predicts. The ordinary
         tolerances are taken up first. A gain of the microphone, which the fan passed as well, is taken out of the residual

@@ -19,7 +19,7 @@ from edgefilter.echo.model import EchoModel
 from edgefilter.errors import UsageError
 
 AHEAD = next(one.name for one in EFFECTS if one.free and one.family == "linear path" and one.stage == "source")
-"""A filter ahead of what bends the voice. Alone it is the one behind, so it is tried beside that only."""
+"""A linear filter ahead of a nonlinear loudspeaker. Without a nonlinearity it is the same as one behind it, and is not tried."""
 Signature: TypeAlias = tuple[tuple[str | bytes, ...], ...]
 
 
@@ -217,8 +217,8 @@ class Workbench:
     def attempt_all(self, model: EchoModel, most: int = 9) -> list[Trial]:
         """Each effect that the model has not and whose complexity is at most `most`.
 
-        Where none of them explains a good part of what is left, those that bend the voice behind a filter; the
-        last resorts only where none of these does either.
+        Where none of them explains a good part of what is left, a nonlinear loudspeaker with
+        a filter ahead of it; the last resorts only where that does not either.
         """
         absent = self.absent(model, most)
         found = self._attempt_in_turn([name for name in absent if not find(name).last_resort], model)
@@ -236,7 +236,7 @@ class Workbench:
         return found + [trial for trial in resorts if trial is not None]
 
     def filtered_ahead(self, model: EchoModel) -> EchoModel | None:
-        """The model with one filter ahead of the loudspeaker in place of those on its path; None where it has none."""
+        """The model with one filter ahead of the loudspeaker in place of its filters on the echo path; None if it has no such filters."""
         others = model
         for name in added(self._start, model):
             if find(name).stage == "path" and find(name).absorbed:

@@ -30,10 +30,11 @@ and of 49 humans noticed within 0.5 s 48 still are, of whom the median one waits
 starts, with 0.03 there are 7, and 47 humans in time."""
 
 UNASKED = 1e-4
-"""Rate of that test at which a calibrated robot takes who speaks for a human before the lower voice is heard: log-odds of 9.2.
-Of 124 such robots of the recipe `field` alone, 25 minutes in closed loop, none that asking had dismissed came above 8.7: 9 false
-starts stay 9 (17 without asking), and of 55 interruptions 51 % are believed within 0.4 s, not 29 (60 without asking). Of 75
-robots without a calibration 3 more would be started falsely, of 5 that asking saves: they always ask."""
+"""Error rate of that test, log-odds of 9.2, at which a calibrated robot believes in a human without waiting for its lower voice to be
+heard. 124 simulated robots alone (recipe `field`, 25 minutes, closed loop): no sum that the lower voice has dismissed exceeded
+8.7; false starts 9 with this bound and without it, 17 without lowering. Of 55 interruptions 51 % are believed within 0.4 s, 29
+without this bound, 60 without lowering. Without a calibration it would give back 3 of the 5 false starts that lowering
+prevents (75 robots), so these robots always wait."""
 
 
 @dataclass(frozen=True)
@@ -81,9 +82,10 @@ class BargeIn:
     Speech is suspected in the first hop that reaches the threshold. The log-odds of the hops that follow, less those of
     the threshold, are added up (Wald 1945, "Sequential tests of statistical hypotheses"): at the bounds of an ERROR, or
     by their sign when the time to confirm is over, speech has begun, or the suspicion is dismissed. Where the robot lowers
-    its voice meanwhile, those bounds only tell whether anybody speaks, and a human is who reaches the bound of UNASKED, or is
-    still heard with the lower voice: from then on the sum begins anew and never falls below 0 (Page 1954, "Continuous
-    inspection schemes"), and who has not reached the upper bound within the time to confirm was the robot.
+    its voice meanwhile, those bounds only tell whether anybody speaks, human or robot. It is a human where the sum reaches the
+    bound of UNASKED, or where speech goes on once the lower voice is heard at the microphone: from that moment on the sum begins
+    anew and never falls below 0 (Page 1954, "Continuous inspection schemes"); if it does not reach the upper bound within
+    the time to confirm, it was the robot.
     hop_s: seconds between two probabilities. settings: None for the defaults. calibrated: whether the robot is.
 
     >>> talk = BargeIn(0.016)
@@ -164,7 +166,7 @@ class BargeIn:
             return self._certain or self._hops < self._asked + self._longest
         late = self._hops >= self._longest
         self._somebody |= self._evidence >= (0.0 if late else self._bound)
-        # whether it is the robot that was asked, the lower voice will tell
+        # while the robot lowers its voice, only what follows tells whether it was the robot
         self._certain = self._somebody and (not self._asked or self._evidence >= self._sure)
         return self._somebody or (self._evidence > -self._bound and not late)
 

@@ -313,7 +313,7 @@ class FreeFilter(FreeLaw):
 
 
 class FreeFilterAhead(FreeFilter):
-    """The same ahead of what bends the voice, as a player's equaliser is; alone it is the one behind."""
+    """One more filter ahead of a nonlinear loudspeaker, as of a player's equaliser; without a nonlinearity it is the same as one behind."""
 
     name = "free_filter_ahead"
     stage = "source"
