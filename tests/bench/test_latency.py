@@ -27,10 +27,11 @@ def test_every_contender_is_timed_hop_by_hop_at_its_own_frame(runs: dict[str, di
 
 @pytest.mark.slow
 def test_stages_add_up_to_less_than_the_whole_and_to_most_of_it(runs: dict[str, dict]) -> None:
-    stages = {name: np.median(times) for name, times in runs["ss"]["stages"].items()}
+    took, stages = np.array(runs["ss"]["took"]), runs["ss"]["stages"]
     assert set(stages) == {"alignment", "canceller", "residual", "analysis", "engine", "overlap-add"}
-    # medians, since what interrupts a hop can fall between stages
-    assert 0.5 < sum(stages.values()) / np.median(runs["ss"]["took"]) < 1.1
+    # of the quickest quarter: what interrupts a hop can fall between stages
+    quickest = np.argsort(took)[: took.size // 4]
+    assert 0.5 < sum(np.array(times)[quickest].sum() for times in stages.values()) / took[quickest].sum() < 1.1
 
 
 @pytest.mark.slow
