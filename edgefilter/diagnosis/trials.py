@@ -115,7 +115,7 @@ class Workbench:
         taken_up = (name for name, values in self._start.effects if vanishes(find(name), values))
         self._without = {*without, *taken_up}
         self._progress = progress
-        self._scores: dict[Signature, Score] = {}
+        self._scores: dict[tuple[Signature, bool], Score] = {}
         self._trials: dict[tuple[Signature, str], Trial | None] = {}
         self._alike: dict[tuple[frozenset[str], str], Trial | None] = {}
         self._failed: dict[str, str] = {}
@@ -133,11 +133,11 @@ class Workbench:
         if names := added(self._start, model):
             self._so_far = f"; so far {' and '.join(names)}: {self.score(model).excess_db:.1f} dB left"
 
-    def score(self, model: EchoModel) -> Score:
-        """The score of a model, worked out once."""
-        key = signature(model)
+    def score(self, model: EchoModel, any_volume: bool = False) -> Score:
+        """The score of a model (Straightened.of), worked out once."""
+        key = signature(model), any_volume
         if key not in self._scores:
-            self._scores[key] = self.recording.of(model)
+            self._scores[key] = self.recording.of(model, any_volume)
         return self._scores[key]
 
     def off_db(self, model: EchoModel) -> float:
@@ -202,7 +202,7 @@ class Workbench:
         if effect.family != "time":
             return trial
         # what a lag explains at the wrong volume is no measure of it: any filter that mutes the voice would explain more
-        before, after = (self.recording.of(each, any_volume=True).level_db for each in (model, trial.model))
+        before, after = (self.score(each, any_volume=True).level_db for each in (model, trial.model))
         return replace(trial, gain_db=max(trial.gain_db, before - after))
 
     def beside(self, name: str, others: EchoModel, model: EchoModel) -> Trial:
@@ -217,8 +217,8 @@ class Workbench:
     def attempt_all(self, model: EchoModel, most: int = 9) -> list[Trial]:
         """Each effect that the model has not and whose complexity is at most `most`.
 
-        Where none of them explains a good part of what is left, a nonlinear loudspeaker with
-        a filter ahead of it; the last resorts only where that does not either.
+        Where none of them explains a good part of what is left, a nonlinear loudspeaker with a filter ahead of it; the last
+        resorts only where that does not either.
         """
         absent = self.absent(model, most)
         found = self._attempt_in_turn([name for name in absent if not find(name).last_resort], model)
@@ -239,7 +239,7 @@ class Workbench:
         """The model with one filter ahead of the loudspeaker in place of its filters on the echo path; None if it has no such filters."""
         others = model
         for name in added(self._start, model):
-            if find(name).stage == "path" and find(name).absorbed:
+            if _on_path(name):
                 others = self.less(others, name)
         ahead = None if others is model else self.attempt(AHEAD, others)
         return ahead.model if ahead else None
@@ -247,7 +247,7 @@ class Workbench:
     def known_by(self, law: Trial) -> Reading | None:
         """The listed filter on the path that explains most of what a law's filter does by itself."""
         start = self._start
-        listed = [one for one in names() if find(one).stage == "path" and find(one).absorbed and not find(one).free]
+        listed = [one for one in names() if _on_path(one) and not find(one).free]
         best = max(
             (fit for one in listed if (fit := self.attempt(one, start))), key=lambda fit: fit.gain_db, default=None
         )
@@ -316,6 +316,11 @@ def added(start: EchoModel, model: EchoModel) -> list[str]:
     """Names of the effects that a model has beyond the start it was made from, or at other values, the latest last."""
     known = dict(start.effects)
     return [name for name, values in model.effects if known.get(name) is not values]
+
+
+def _on_path(name: str) -> bool:
+    """Whether an effect is a filter behind the loudspeaker, which a linear path holds as well."""
+    return find(name).stage == "path" and find(name).absorbed
 
 
 def noisy(model: EchoModel) -> bool:

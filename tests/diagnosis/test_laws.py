@@ -257,4 +257,5 @@ def test_an_equaliser_ahead_of_what_bends_the_voice_is_told_from_one_behind() ->
     found = diagnose(profile(), record((peak * np.tanh(coloured / peak)).astype(np.float32)), x)
     assert [finding.name for finding in found.ranking] == ["equaliser", "speaker_nonlinearity"]
     assert found.ranking[0].effect == "free_filter_ahead" and found.ranking[0].like.share > 0.9
+    assert "a filter of 8 ms" in found.ranking[0].evidence
     assert found.comparison.excess_db > 20.0 and found.remaining_db < 1.0  # with the equaliser behind: 15

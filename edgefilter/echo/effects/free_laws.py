@@ -306,8 +306,9 @@ class FreeFilter(FreeLaw):
     def sentence(self, values: Values) -> str:
         _, _, hz, gain_db, _ = self.drawn(values)
         high, low = int(np.argmax(gain_db)), int(np.argmin(gain_db))
+        ms = 1000 * np.size(values["taps"]) // SAMPLE_RATE
         return (
-            f"a filter of {1000 * TAPS // SAMPLE_RATE} ms, {gain_db[high]:+.1f} dB at {hz[high]:.0f} Hz and {gain_db[low]:+.1f}"
+            f"a filter of {ms} ms, {gain_db[high]:+.1f} dB at {hz[high]:.0f} Hz and {gain_db[low]:+.1f}"
             f" dB at {hz[low]:.0f} Hz"
         )
 
