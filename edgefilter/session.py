@@ -81,7 +81,7 @@ class Verdict:
     removed_db: by how much the robot alone was lowered, None where it was not found; lag_ms: of its voice behind the reference,
     negative where the reference came later, None where it is not known.
     noticed: how often a human was, None where the engine does not judge it. wrong: what was set up wrongly, a sentence each,
-    of each kind of event the latest.
+    of each kind of event the latest with its time: later on it may have come right.
     """
 
     removed_db: float | None
@@ -181,7 +181,7 @@ def filter_blocks(
             tell(event)
             noticed += event.kind == "speech_started"
             if event.kind in SET_UP_WRONG:
-                wrong[event.kind] = event.detail
+                wrong[event.kind] = f"at {event.sample / SAMPLE_RATE:.1f} s {event.detail}"
             report.events.append(replace(event, turn=None, sound=None))
 
     try:

@@ -76,4 +76,4 @@ def test_a_verdict_counts_what_the_report_no_longer_keeps():
     report = filter_blocks(
         [block], Judge(engine="bypass"), Nowhere(), troubles=lambda sample, last: [] if last else said
     )
-    assert report.verdict and (report.verdict.noticed, report.verdict.wrong) == (1500, ("it is late",))
+    assert report.verdict and (report.verdict.noticed, report.verdict.wrong) == (1500, ("at 0.0 s it is late",))
