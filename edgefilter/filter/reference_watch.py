@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections import deque
+from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
@@ -16,7 +17,7 @@ from edgefilter.alignment.utterances import FLOOR, VARIES, Sustained
 from edgefilter.dsp import fourier
 from edgefilter.dsp.lag import one_signal
 from edgefilter.filter.microphones import SILENT
-from edgefilter.filter.playback_faults import LENGTH, SPEEDS, other_speed
+from edgefilter.filter.playback_faults import AHEAD, BEHIND, CLEAR, LENGTH, STEP, other_rates, speeds
 from edgefilter.filter.removal import Removal
 from edgefilter.filter.robot_sound import LOUD, RobotSound
 from edgefilter.filter.volume import pre_emphasised
@@ -31,8 +32,7 @@ converter, since there is nothing else to compare with. 16 bits by themselves ar
 FELL_SILENT = 1e-3
 """Power of the reference, over its power while the robot talks, below which it is silent, -30 dB: the noise of a loopback is."""
 SPEED_STRIDE, SPEED_LOOKS = SAMPLE_RATE, 8
-"""Samples of speech between two comparisons of the speed, and how many there are at most: the echo is not found meanwhile, and
-each costs half a hop."""
+"""Samples of speech between two looks at the speed, and how many there are at most: the echo is not found meanwhile."""
 SAME_S = 2.0
 """Seconds of sound after which microphone and reference are compared sample by sample."""
 Verdict = Literal["unknown", "fits", "late"]
@@ -55,8 +55,10 @@ class ReferenceWatch:
         self.without = self.same = False
         self._late = 0
         self._missing, self._grew, self._another = "", False, False
-        self._speed: float | None = None
-        self._off_speed, self._to_compare, self._compared = False, 0, 0
+        self._off_speed = False
+        self._seen_speeds: list[tuple[float, float]] = []  # logarithm of what each look has found, and how clearly
+        self._speeds: Iterator[tuple[float, float] | None] = iter(())  # of the look that is under way
+        self._to_compare, self._looks_left = LENGTH, SPEED_LOOKS
         self._idle = True
         self._sustained, self._loudest, self._least = Sustained(), 0.0, float("inf")
         self._rise = 10 ** (hop / (10 * SAMPLE_RATE))
@@ -130,8 +132,8 @@ class ReferenceWatch:
         )
 
     def _lacks_samples(self) -> str:
-        """Say that the lag grows again and again."""
-        if not self._missing or not self._once("gaps"):
+        """Say that the lag grows again and again, and not because the reference is played more slowly."""
+        if not self._missing or not self._seen_speeds or self._off_speed or not self._once("gaps"):
             return ""
         return (
             f"{self._missing}; little of the robot is removed, and nobody is noticed while it talks; use a loopback that loses"
@@ -139,30 +141,33 @@ class ReferenceWatch:
         )
 
     def _compare_speed(self, aligned: Aligned) -> str:
-        """While the echo is not found, look for it at other speeds; believe what two looks in a row find."""
+        """While the echo is not found, look for it at other speeds, one of them a hop; add up what looks have found."""
         if aligned.state == "locked":
-            self._off_speed, self._speed = False, None
+            self._off_speed, self._seen_speeds, self._speeds = False, [(0.0, CLEAR)], iter(())
             return ""
         heard, ref, onsets = aligned.past
-        start = ref.end - round(SPEEDS[0] * LENGTH)
-        if not onsets.active or start < onsets.current.start or self._compared == SPEED_LOOKS:
+        self._to_compare -= self._hop * onsets.active
+        found = next(self._speeds, False)
+        if not isinstance(found, tuple):  # a look is under way, or none is
+            if found is False and onsets.active and self._to_compare <= 0 < self._looks_left:
+                self._to_compare, self._looks_left = SPEED_STRIDE, self._looks_left - 1
+                start = ref.end - AHEAD - LENGTH
+                self._speeds = speeds(heard.read(start, start + LENGTH), ref.read(start - BEHIND, ref.end))
+                next(self._speeds)  # while both are as they were read
             return ""
-        self._to_compare -= self._hop
-        if self._to_compare > 0:
-            return ""
-        self._to_compare, self._compared = SPEED_STRIDE, self._compared + 1
-        before = self._speed
-        self._speed = other_speed(heard.read(start, start + LENGTH), ref.read(start, ref.end))
-        if self._speed is None or self._speed != before:
+        speed = math.log(found[0])
+        self._seen_speeds.append((speed, found[1]))
+        right = sum(clear for at, clear in self._seen_speeds if abs(at) <= STEP / 2)
+        alike = sum(clear for at, clear in self._seen_speeds if abs(at) > STEP / 2 and abs(at - speed) < STEP)
+        if abs(speed) <= STEP / 2 or alike - right < CLEAR:
             return ""
         self._off_speed = True
         if not self._once("speed"):
             return ""
-        taken, has = ("44.1", "48") if self._speed > 1.0 else ("48", "44.1")
+        off, way = 100 * abs(found[0] - 1.0), "faster" if speed > 0.0 else "slower"
         return (
-            f"the loudspeaker plays the reference {100 * abs(self._speed - 1.0):.1f} % {'faster' if self._speed > 1.0 else 'slower'}"
-            f" than it is given: {taken} kHz seem to be played as {has} kHz; nothing of the robot is removed, and nobody is"
-            " noticed while it talks; give the player the rate that its sound has"
+            f"the loudspeaker plays the reference {off:.1f} % {way} than it is given{other_rates(found[0])}; nothing of the"
+            " robot is removed, and nobody is noticed while it talks; give the player the rate that its sound has"
         )
 
     def _same(self, mic: Samples, ref: Samples) -> str:
@@ -234,7 +239,8 @@ class ReferenceWatch:
 
     def _unheard(self, aligned: Aligned) -> str:
         """Say that the microphone hears something while the reference plays, but not the reference."""
-        if aligned.state == "locked":
+        if aligned.state == "locked":  # what was believed before is refuted
+            self._another = False
             self._said.discard("unfound")
         if not self._another or self._displaced or not self._once("unfound"):
             return ""

@@ -10,7 +10,10 @@ from scipy import signal
 
 import edgefilter
 from edgefilter import EgoFilter
-from edgefilter.alignment.aligner import Aligned
+from edgefilter.alignment.aligner import Aligned, Past
+from edgefilter.alignment.belief import Belief
+from edgefilter.alignment.delay_line import DelayBuffer
+from edgefilter.alignment.utterances import OnsetDetector
 from edgefilter.filter.barge_in import BargeIn
 from edgefilter.filter.reference_watch import ReferenceWatch
 from edgefilter.filter.removal import Removal
@@ -293,13 +296,17 @@ def test_a_linear_path_is_not_blamed_while_it_is_being_learned(seed):
     assert ego.stats()["linear_stage"]["removed_db"] > 15.0
 
 
-@pytest.mark.parametrize(("speed", "words"), [(48 / 44.1, "8.8 % faster"), (44.1 / 48, "8.1 % slower")])
-def test_a_loudspeaker_that_plays_at_another_speed_is_named_and_nobody_is_noticed_any_more(speed, words):
+@pytest.mark.parametrize("speed", [0.87, 44.1 / 48, 0.97, 0.99, 1.01, 1.05, 48 / 44.1, 1.15])
+def test_a_loudspeaker_that_plays_at_another_speed_is_named_and_nobody_is_noticed_any_more(speed):
     mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0][: 8 * RATE] for name in ("mic", "reference"))
-    heard = np.interp(np.arange(mic.size) * speed, np.arange(mic.size), mic).astype(np.float32)
+    heard = np.interp(LAG + np.arange(mic.size - LAG) * speed, np.arange(mic.size), mic).astype(np.float32)
+    heard = np.concatenate((np.zeros(LAG, np.float32), heard))
     said = [event for event in events(EgoFilter(engine="crnn"), heard, ref) if event.kind in SET_UP_WRONG]
-    assert [event.kind for event in said] == ["rate_mismatch"] and words in said[0].detail
-    assert said[0].sample < 6 * RATE
+    assert [event.kind for event in said] == ["rate_mismatch"] and said[0].sample < 6 * RATE
+    percent, way = re.search(r"([\d.]+) % (faster|slower)", said[0].detail).groups()
+    assert float(percent) / 100 == pytest.approx(abs(speed - 1.0), abs=0.006)
+    assert way == ("faster" if speed > 1.0 else "slower")
+    assert ("44.1 kHz" in said[0].detail) == (speed in (48 / 44.1, 44.1 / 48))
 
 
 def test_a_reference_that_loses_samples_is_named_and_one_whose_lag_changes_with_each_utterance_is_not(robot):
@@ -326,3 +333,15 @@ def test_a_lag_of_nearly_three_seconds_is_found(robot):
     ego = EgoFilter(engine="linear")
     events(ego, later(mic, round(2.8 * RATE) - LAG), ref)
     assert ego.stats()["alignment"]["delay_samples"] == pytest.approx(2.8 * RATE, abs=40)
+
+
+def test_an_utterance_that_is_found_in_the_end_is_not_said_to_be_unfound_hop_after_hop():
+    watch, hop, onsets = ReferenceWatch(1600, 1601), np.ones(1600, np.float32), OnsetDetector(1600)
+    for level in (1e-3, 0.1, 0.1, 0.1, 0.1):
+        onsets.step(level * hop)
+    nothing = Belief(np.zeros(1, int), np.zeros(1, int), np.zeros(1), np.zeros(1), -20.0)
+    begun = Aligned(hop, 0.0, 0.0, 0.0, "begun", False, past=Past(DelayBuffer(1600), DelayBuffer(1600), onsets))
+    said = [watch.step(1e-3 * hop, 0.1 * hop, begun, SILENT_FRAME, Removal(1600), False)]
+    for aligned in [*[begun._replace(belief=nothing)] * 8, *[begun._replace(state="locked")] * 8]:
+        said.append(watch.step(0.1 * hop, 0.1 * hop, aligned, SILENT_FRAME, Removal(1600), False))
+    assert [kind for found in said for kind, _ in found] == ["robot_unfound"]
