@@ -175,14 +175,17 @@ class Straightened:
             voice, white = volume * voice, volume * white
         corrected = here.correct(voice, white)
         unpredictable = model.unpredictable(reference)
-        passed, gain = model.passed(here._fan, reference), model.microphone_gain(self.usable.size)
+        fan, gain = model.fan(here._fan), model.microphone_gain(self.usable.size)
+        passed = model.passed(fan, reference)
         residual = measurement.recording - corrected
         expected = (*unpredictable, *self.ordinary)
         variance = here._expected_cells(expected)
         plain = measurement.whiten(residual / gain).astype(np.float64) ** 2
-        power = here._over_expected(plain, expected) if expected else plain
         if passed is not here._fan:
             variance = variance * (here.cells(passed + here._rounding) / here._fan_cells)
+        if fan is not here._fan:
+            plain = plain + (1.0 - measurement.whiten(fan).astype(np.float64) ** 2)
+        power = here._over_expected(plain, expected) if expected else plain
         cells = here.cells(residual) / variance
         levels = decibels(0.5 + 0.5 * cells)
         over_db = _mean(levels)

@@ -125,8 +125,12 @@ class Effect:
         return np.full(601, 1.0 / 8000.0)
 
     def passed(self, noise: Samples, voice: Samples, values: Values, sample_rate: int) -> Samples:
-        """What a gain by level behind the microphone lets through of the fan's sound (n,) beside a voice (n,); by default all of it."""
+        """What is heard of the fan's sound (n,) beside a voice (n,): not all behind a gain by level, another one before the fan has changed."""
         return noise
+
+    def elsewhere(self, values: Values) -> Values | None:
+        """The values that hold in other recordings; None, by default of an event: there it is left out."""
+        return None if self.event else values
 
     def sentence(self, values: Values) -> str:
         """What in a recording speaks for the effect, with figures; empty: nothing but that the residual falls."""

@@ -122,6 +122,13 @@ class EchoModel:
         scaling = [(effect, values) for effect, values in chain(self.effects) if effect.scales_fan]
         return _through(scaling, np.ones(size, np.float32))
 
+    def fan(self, noise: Samples) -> Samples:
+        """The fan's sound (n,) in this recording, from one (n,) like that at its end; noise itself where it never changes."""
+        for effect, values in chain(self.effects):
+            if effect.stage == "noise":
+                noise = effect.passed(noise, noise, values, SAMPLE_RATE)
+        return noise
+
     def passed(self, noise: Samples, reference: Samples) -> Samples:
         """What the effects let through of the fan's sound (n,) beside the voice of an aligned reference (n,); noise itself where that is all."""
         applied = chain(self.effects)
@@ -186,18 +193,26 @@ class EchoModel:
             for other, _ in ahead:
                 model = model.without_effect(other.name)
         values = complete(effect, effect.fit(behind, model))
-        if effect.event and not vanishes(effect, values):
+        if RECORDING in effect.parameters and not vanishes(effect, values):
             values[RECORDING.name] = measurement.fingerprint
         return values
 
     def lasting(self) -> EchoModel:
-        """The model without its events: what holds of the robot in any recording."""
-        return self._with_those(lambda name, _: not find(name).event)
+        """What holds of the robot in any recording: the model without its events."""
+        return self._as_in(())
 
     def during(self, measurement: Measurement) -> EchoModel:
         """The model without the events of other recordings: a jump does not come again at the same second of another one."""
-        here = (0.0, measurement.fingerprint)
-        return self._with_those(lambda name, values: not find(name).event or values.get(RECORDING.name, 0.0) in here)
+        return self._as_in((0.0, measurement.fingerprint))
+
+    def _as_in(self, recordings: Sequence[float]) -> EchoModel:
+        """The model as it is in these recordings, known by their fingerprints; itself where nothing changes."""
+        known = [(n, v if v.get(RECORDING.name) in recordings else find(n).elsewhere(v)) for n, v in self.effects]
+        effects = tuple((name, values) for name, values in known if values is not None)
+        same = len(effects) == len(self.effects) and all(
+            a[1] is b[1] for a, b in zip(effects, self.effects, strict=True)
+        )
+        return self if same else replace(self, effects=effects)
 
 
 def _through(effects: Chain, x: Samples) -> Samples:

@@ -71,6 +71,16 @@ def test_another_fan_is_paid_or_charged_half_of_its_decibels(louder_db, gain_db)
     assert before.level_db - after.level_db == pytest.approx(gain_db, abs=0.3)
 
 
+def test_a_fan_is_expected_as_it_was_until_it_changes():
+    x, robot = voice(8.0), profile()
+    gain = np.where(np.arange(x.size) < x.size // 2, 1.0, 4.0).astype(np.float32)
+    prepared = prepare(robot, record(x) + (gain - 1.0) * record(0.0 * x), x)
+    model = prepared.model.with_effect("fan_noise", {"spectrum_db": 20 * np.log10(4.0), "from_s": 4.0})
+    score = prepared.of(model)
+    assert np.ptp(10 * np.log10(score.cells.mean(axis=1))) < 3.0 and abs(score.over_db) < 0.5
+    assert abs(score.excess_db) < 0.5 and abs(score.silent_db) < 0.5
+
+
 def test_a_gain_behind_the_microphone_is_expected_on_the_fan_as_well():
     x, robot = voice(6.0), profile()
     gain = 10 ** (np.interp(np.arange(x.size), [0, x.size], [6.0, -12.0]) / 20).astype(np.float32)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from edgefilter.dsp.frames import decibels, frames
-from edgefilter.dsp.psd import floored, periodograms
+from edgefilter.dsp.psd import GRID_BINS, floored, periodograms
 from edgefilter.dsp.tones import tones
-from edgefilter.echo.effect import Effect, Parameter, first, neutral, within
-from edgefilter.echo.least_squares import absorbed
+from edgefilter.echo.effect import NEVER_S, RECORDING, Effect, Parameter, first, neutral, within
+from edgefilter.echo.least_squares import absorbed, filtered
 from edgefilter.echo.measurement import SILENT, STEADY_DB, Measurement, Values, VoiceModel
-from edgefilter.types import Array, Samples
+from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 FEWEST_FRAMES, QUIET_SHARE = 12, 0.25
 """Half-overlapping frames of silence; with fewer, that part of all frames, the quietest at each frequency, is taken."""
@@ -22,7 +22,7 @@ class FanNoise(Effect):
     """The fan's power spectrum is another by spectrum_db at each frequency; the voice itself is unchanged.
 
     spectrum_db: (601,) on the profile's grid, 0 to 8 kHz, or one number. change_db only reports: the change of the
-    fan's total power.
+    fan's total power. from_s: when it changes, in the recording that it was fitted to; in others it is as it became.
     """
 
     name = "fan_noise"
@@ -33,10 +33,23 @@ class FanNoise(Effect):
     parameters = (
         Parameter("spectrum_db", "dB", 0.0, -60.0, 60.0),
         Parameter("change_db", "dB", 0.0, -60.0, 60.0),
+        Parameter("from_s", "s", 0.0, 0.0, NEVER_S),
+        RECORDING,
     )
 
     def noise_psd(self, values: Values, psd: Samples) -> Samples:
         return (psd * 10.0 ** (np.asarray(values["spectrum_db"], float) / 10.0)).astype(np.float32)
+
+    def passed(self, noise: Samples, voice: Samples, values: Values, sample_rate: int) -> Samples:
+        start = round(first(values, "from_s") * sample_rate)
+        if not 0 < start:
+            return noise
+        taps = np.fft.irfft(10.0 ** (-np.broadcast_to(values["spectrum_db"], GRID_BINS) / 20.0))
+        before = filtered(noise[:start], np.roll(taps, GRID_BINS - 1), GRID_BINS - 1)
+        return np.concatenate((before, noise[start:]))
+
+    def elsewhere(self, values: Values) -> Values:
+        return {**values, "from_s": 0.0} if first(values, "from_s") else values
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Mean periodogram of the residual in the robot's silences over the calibrated PSD.
@@ -57,25 +70,50 @@ class FanNoise(Effect):
         whole = frames(measurement.weights, size, size // 2).all(axis=1)
         own = np.mean(frames(measurement.whiten(voice), size, size // 2) ** 2, axis=1)
         silent = whole & (own < SILENT)
-        if silent.sum() >= FEWEST_FRAMES:
-            found = residual[silent].mean(axis=0)
-        else:
-            found = _quiet_mean(residual[whole] if whole.any() else residual)
-        if silent.any():
-            heard, was, now = residual[silent], floored(known), floored(found)
-            swing_db = np.ptp(decibels(np.quantile(np.mean(heard / now, axis=1), (0.1, 0.9))))
-            if swing_db > STEADY_DB or np.mean(np.log(now / was) + heard / now - heard / was) > 0.0:
+        heard, was, start = residual[silent], floored(known), 0
+        quiet = residual[whole] if whole.any() else residual
+        found = heard.mean(axis=0) if len(heard) >= FEWEST_FRAMES else _quiet_mean(quiet)
+        if len(heard) and _swings(heard, found):
+            start = _turn(heard, was)
+            if not start or abs(np.median(_levels_db(heard[:start], was))) > STEADY_DB:
                 return neutral(self)
+            heard, found = heard[start:], heard[start:].mean(axis=0)
+        now = floored(found)
+        if len(heard) and (_swings(heard, found) or np.mean(np.log(now / was) + heard / now - heard / was) > 0.0):
+            return neutral(self)
+        from_s = float(np.flatnonzero(silent)[start] * size / 2 / SAMPLE_RATE) if start else 0.0
         floor = floored(known if measurement.calibrated_psd is None else measurement.calibrated_psd)
         smooth = np.convolve(np.pad(found / floor, 1, mode="edge"), SMOOTH, "valid")
         total = 10.0 * np.log10(np.sum(smooth * floor) / np.sum(floor) + 1e-30)
-        return within(self, {"spectrum_db": 10.0 * np.log10(smooth + 1e-30), "change_db": total})
+        return within(self, {"spectrum_db": 10.0 * np.log10(smooth + 1e-30), "change_db": total, "from_s": from_s})
 
     def sentence(self, values: Values) -> str:
+        from_s = first(values, "from_s")
+        since = f" from {from_s:.1f} s on" if from_s else ""
         return (
-            f"the noise is {first(values, 'change_db'):+.1f} dB off the calibrated fan, with the robot's voice and"
+            f"the noise is {first(values, 'change_db'):+.1f} dB off the calibrated fan{since}, with the robot's voice and"
             " without it"
         )
+
+
+def _swings(heard: Array, expected: Array) -> bool:
+    """Whether periodograms (f, b) are at times louder, and at times softer, than a density (b,)."""
+    return bool(np.ptp(np.quantile(_levels_db(heard, expected), (0.1, 0.9))) > STEADY_DB)
+
+
+def _levels_db(heard: Array, expected: Array) -> Array:
+    """Of each of periodograms (f, b) the mean over a density (b,), dB, (f,)."""
+    return np.asarray(decibels(np.mean(heard / floored(expected), axis=1)))
+
+
+def _turn(heard: Samples, was: Array) -> int:
+    """From which of periodograms (f, b) on they are likeliest to lie around a mean of their own, until then around was (b,); 0 for none."""
+    rest = np.arange(len(heard), 0, -1)
+    after = np.cumsum(heard[::-1], axis=0)[::-1] / rest[:, None]
+    before = np.cumsum(np.sum(np.log(was) + heard / was, axis=1))[:-1]
+    cost = before + rest[1:] * np.sum(np.log(floored(after[1:].astype(np.float32))) + 1.0, axis=1)
+    possible = cost[FEWEST_FRAMES - 1 : 1 - FEWEST_FRAMES]
+    return FEWEST_FRAMES + int(np.argmin(possible)) if possible.size else 0
 
 
 def _quiet_mean(power: Array) -> Array:

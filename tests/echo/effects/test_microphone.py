@@ -109,6 +109,27 @@ def test_fan_is_found_under_a_robot_that_never_pauses():
     assert found["change_db"] == pytest.approx(3.0, abs=0.5)
 
 
+@pytest.mark.parametrize("change_db", [12.0, -6.0])
+def test_fan_that_changes_later_on_is_found_with_its_moment_and_stays_as_it_became(change_db):
+    """It swung, so nothing was found, and beside another effect the verdict was "unexplained"."""
+    measurement, model = robot_alone()
+    grown = np.interp(np.arange(192_000), [80_000, 96_000], [0.0, 1.0]).astype(np.float32)
+    talks = np.arange(192_000) // 8000 % 3 > 0
+    measurement = replace(measurement, reference=measurement.reference * talks)
+    voice, new = model.predict(measurement.reference), np.float32(10 ** (change_db / 20)) * fan(192_000, seed=9)
+    now = voice + np.sqrt(1 - grown) * fan(192_000, seed=8) + np.sqrt(grown) * new
+    found = model.fitted("fan_noise", replace(measurement, recording=now))
+    assert 5.0 <= found["from_s"] <= 6.5 and found["change_db"] == pytest.approx(change_db, abs=0.7)
+    heard = catalogue.find("fan_noise").passed(new, voice, found, 16_000)
+    assert 20 * np.log10(np.std(heard[:80_000]) / np.std(heard[100_000:])) == pytest.approx(-change_db, abs=1.0)
+    known = model.with_effect("fan_noise", found)
+    here, *others = known.during(replace(measurement, recording=now)), known.during(measurement), known.lasting()
+    assert here is known
+    for other in others:
+        values = dict(other.effects)["fan_noise"]
+        assert (values["from_s"], values["change_db"]) == (0.0, found["change_db"])
+
+
 def test_calibrated_fan_has_not_changed():
     found = catalogue.find("fan_noise").fit(*robot_alone())
     assert abs(found["change_db"]) < 0.3 and np.abs(np.median(found["spectrum_db"])) < 0.3
