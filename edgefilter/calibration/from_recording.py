@@ -88,7 +88,8 @@ def self_calibrate(recording: Samples, reference: Samples, *, sample_rate: int =
     The path is a regularised least-squares filter on every other half second, those that a diagnosis fits on, so that
     the others say how well it predicts. Samples weigh the less the more the first fit leaves of them (iteratively
     reweighted least squares, Huber 1981), so that a talker does not bend it. The fan is what the robot's silences hold.
-    Stationary linear effects are in it at their neutral values, so that no search claims them.
+    Stationary linear effects and the fan's are in it at their neutral values, so that no search claims them: without a
+    calibration nothing tells that the fan has changed.
 
     Examples
     --------
@@ -117,7 +118,7 @@ def self_calibrate(recording: Samples, reference: Samples, *, sample_rate: int =
     bands, snr = bands_over_fan(predicted)
     echo = EchoModel(path.astype(np.float32))
     for effect in EFFECTS:  # those that come with the package: whoever loads the profile knows no others
-        if effect.absorbed:
+        if effect.absorbed or effect.stage == "noise":
             echo = echo.with_effect(effect.name, {})
     return Profile(
         echo=echo,
@@ -259,8 +260,8 @@ def others(target: Samples, predicted: Samples) -> list[tuple[float, float]]:
 
 def _warnings(seconds: float, talk: list[tuple[float, float]]) -> list[str]:
     told = [
-        "no calibration: a gain, a band limit, a resonance and the room's reverberation are part of the path made here"
-        " and cannot be told"
+        "no calibration: a gain, a band limit, a resonance, the room's reverberation and another fan are part of what is"
+        " measured here and cannot be told"
     ]
     if seconds == 0.0:
         told.append("the robot is hardly silent here: the quietest moments of the recording stand for the fan")

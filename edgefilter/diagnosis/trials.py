@@ -111,7 +111,7 @@ class Workbench:
     ) -> None:
         self.recording, self.criteria = recording, criteria
         self._start = start or recording.model
-        # what the start has at neutral values is in its path (Effect.absorbed): no search claims it
+        # what the start has at neutral values is in what was measured (self_calibrate): no search claims it
         taken_up = (name for name, values in self._start.effects if vanishes(find(name), values))
         self._without = {*without, *taken_up}
         self._progress = progress

@@ -1,41 +1,16 @@
-"""What diagnosis, comparison and probe say of recordings, number by number: as it was before."""
+"""What a comparison says of recordings, number by number, and the sounds that a probe plays: as it was before."""
 
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from edgefilter import compare, diagnose
+from edgefilter import compare
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.probe import menu
-from edgefilter.diagnosis.result import Diagnosis
 from edgefilter.echo.model import EchoModel
 from tests.as_before import levels_db, same_as_before
 from tests.diagnosis.robot_scene import path, profile, record, voice
-
-
-def told(found: Diagnosis) -> dict:
-    """All but intervals, p-values and what is drawn for experts: these depend on the last bits of a search."""
-    known = found.to_dict()
-    ranking = [
-        {
-            **{name: one[name] for name in ("effect", "excess_after_db", "share", "evidence")},
-            "values": {name: interval["value"] for name, interval in one["parameters"].items()},
-        }
-        for one in known["ranking"]
-    ]
-    tried = [
-        {name: one[name] for name in ("effect", "verdict", "why", "gain_db", "beside_db")} for one in known["tried"]
-    ]
-    plain = ("verdict", "excess_db", "remaining_db", "evidence", "where", "advice", "law", "warnings")
-    zones = known["independence"]["of_findings"]["zones"] if known["independence"]["of_findings"] else []
-    depends = [(zone["meaning"], zone["share"]) for zone in zones]
-    return {
-        **{name: known[name] for name in plain},
-        "ranking": ranking,
-        "tried": tried,
-        "depends": depends,
-    }
 
 
 def bent(x: np.ndarray) -> np.ndarray:
@@ -46,25 +21,12 @@ def with_effect(name: str, **values: float) -> Callable[[np.ndarray], np.ndarray
     return lambda x: record(x, EchoModel(path()).with_effect(name, values))
 
 
-def drifting_band(x: np.ndarray) -> np.ndarray:
-    effects = {"clock_drift": {"ppm": 80.0}, "bandlimit": {"cutoff_hz": 3300.0}}
-    return record(x, EchoModel(path(), tuple(effects.items())))
-
-
 HAPPENED = {
     "bent": bent,
     "turned_down": with_effect("playback_gain", gain_db=-4.0),
     "elsewhere": lambda x: record(x, EchoModel(path(seed=2))),
     "later": lambda x: record(x, lag=37.4),
-    "drifting_band": drifting_band,
-    "expanded": lambda x: record((x * np.minimum(np.abs(x) / 0.1, 1.0) ** 0.5).astype(np.float32)),
 }
-
-
-@pytest.mark.parametrize("what", ["later", "drifting_band", "expanded"])
-def test_of_a_small_robot(what: str) -> None:
-    x = voice(8.0)
-    same_as_before(f"diagnosis_{what}", told(diagnose(profile(), HAPPENED[what](x), x)), 0.1, 0.02)
 
 
 def interrupted(x: np.ndarray) -> np.ndarray:

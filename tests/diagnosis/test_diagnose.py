@@ -105,6 +105,16 @@ def test_a_gain_control_is_found_beside_another_room_without_which_it_does_not_l
 
 
 @pytest.mark.slow
+def test_a_drift_and_a_band_limit_are_told_with_what_they_are() -> None:
+    x, truth = voice(SECONDS), {"clock_drift": {"ppm": 80.0}, "bandlimit": {"cutoff_hz": 3300.0}}
+    found = diagnose(profile(), record(x, EchoModel(path(), tuple(truth.items()))), x)
+    told = {finding.effect: finding.parameters for finding in found.ranking}
+    assert found.verdict == "missing" and told.keys() == truth.keys() and found.remaining_db < 0.5
+    assert told["clock_drift"]["ppm"].value == pytest.approx(80.0, abs=2.0)
+    assert told["bandlimit"]["cutoff_hz"].value == pytest.approx(3300.0, rel=0.05)
+
+
+@pytest.mark.slow
 def test_a_search_that_ends_at_its_most_effects_says_so() -> None:
     x = voice(SECONDS)
     clipped = np.clip(echo(x) + 0.6 * signal.lfilter(*signal.iirpeak(1200.0, 30.0, fs=16000), echo(x)), -0.06, 0.06)
