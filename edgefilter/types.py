@@ -60,14 +60,10 @@ class Frame(NamedTuple):
 
 
 class Output(NamedTuple):
-    """An engine's answer: the human's spectrum (bins,) complex64 and, if it judges that, whether a human speaks (0-1).
-
-    unexplained: power of the judged answer in bins where the error stands out of noise and residual echo, and in all bins.
-    """
+    """An engine's answer: the human's spectrum (bins,) complex64 and, if it judges that, whether a human speaks (0-1)."""
 
     spectrum: Spectrum
     speech_probability: float | None = None
-    unexplained: tuple[float, float] = (1.0, 1.0)
 
 
 _Speech: TypeAlias = Literal["speech_suspected", "speech_dismissed", "speech_started", "speech_stopped", "voice_gain"]
@@ -127,8 +123,8 @@ class Event:
         Of "speech_stopped": what the human said, for a recogniser that takes a turn as a whole; dropped after some time
         where nobody asks for the event.
     sound : Turn, optional
-        Of "speech_started" and "speech_stopped": at least the last 300 ms before it at 16 kHz, without the robot, for a
-        classifier of turns or backchannels; at the start of a recording there is less.
+        Of "speech_started" and "speech_stopped": from at least 300 ms before speech was suspected, or had stopped, until then,
+        at 16 kHz, without the robot, for a classifier of turns or backchannels; at the start of a recording there is less.
     """
 
     kind: EventKind

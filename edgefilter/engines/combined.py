@@ -81,7 +81,7 @@ class Ladder:
             return other, LadderState(coming)
         spectrum = output.spectrum + np.float32(weight) * (other.spectrum - output.spectrum)
         louder = output if weight < 0.5 else other
-        return Output(spectrum, louder.speech_probability, louder.unexplained), LadderState(
+        return Output(spectrum, louder.speech_probability), LadderState(
             heard, coming, max(state.filling - 1, 0), weight
         )
 
@@ -142,7 +142,7 @@ class Judged:
     def step(self, frame: Frame, state: EngineState) -> tuple[Output, EngineState]:
         output, own = self._engine.step(frame, state[0])
         judged, other = self._judge.step(frame, state[1])
-        return Output(output.spectrum, judged.speech_probability, judged.unexplained), (own, other)
+        return Output(output.spectrum, judged.speech_probability), (own, other)
 
 
 def with_network_as_judge(engine: Engine | ClipEngine, profile: Profile | None = None) -> Engine | ClipEngine:

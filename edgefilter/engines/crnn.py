@@ -43,9 +43,6 @@ FAINT = 1e-4
 ten of the frames in which a human 20 to 26 dB below the robot is noticed are above it. What is left of one real loudspeaker,
 with something soft behind it, sounds human to the network at -46 to -40 dB (tuning half). With -45 and -40 dB the same humans
 are noticed as soon."""
-STANDS_OUT = np.float32(6.3)
-"""Power of the error over what noise and residual echo lead to expect, 8 dB, from which on a bin is explained by neither: with 6 dB 16
-false starts beside motors are left (residual_echo.py), not 11."""
 LASTING = 3
 """Frames that must be as loud, so that no click counts."""
 
@@ -117,7 +114,6 @@ class Crnn:
         scale = mic.factor(LOUD[0])
         places = self._run(frame, tensors, scale, reference.factor(LOUD[1]))
         human: Spectrum = places.spectrum * np.float32(1.0 / scale)
-        unexplained = _unexplained(human, frame)
         if self._ss_helps:
             masked, mask = self._ss.step(frame, mask)
             human = (1 - SHARE_OF_SS) * human + SHARE_OF_SS * masked.spectrum
@@ -129,7 +125,7 @@ class Crnn:
             return Output(frame.error, 0.0), self.initial_state()
         following = tuple(place.copy() for place in places.next_states)
         speaks = 0.0 if power < FAINT * mic.loudest else min(max(places.probability.item(), 0.0), 1.0)
-        return Output(gain * human, speaks, unexplained), (following, mask, (mic, reference))
+        return Output(gain * human, speaks), (following, mask, (mic, reference))
 
     def _run(self, frame: Frame, state: tuple[Samples, ...], mic: np.float32, reference: np.float32) -> Places:
         """Run the network on a frame whose microphone and reference are scaled by these factors; its answers are in what is returned."""
@@ -179,13 +175,6 @@ def _with_what_is_sure(human: Spectrum, frame: Frame) -> Spectrum:
         short = least > fourier.power(human)
     human[short] = np.sqrt(least[short] / power[short]) * error[short]
     return human
-
-
-def _unexplained(human: Spectrum, frame: Frame) -> tuple[float, float]:
-    """Power of an answer in bins where the error stands out of noise and residual echo, and in all bins."""
-    power = fourier.power(human)
-    stands_out = fourier.power(frame.error) > STANDS_OUT * (frame.noise_psd + frame.residual_psd)
-    return float(power @ stands_out), float(np.add.reduce(power) + fourier.TINY)
 
 
 def _power(spectrum: Spectrum) -> float:

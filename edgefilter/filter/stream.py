@@ -18,7 +18,6 @@ from edgefilter.errors import SignalError
 from edgefilter.filter.barge_in import (
     INTERRUPTIONS,
     SUSPICIONS,
-    UNEXPLAINED_MEMORY,
     BargeIn,
     BargeInSettings,
     human_probability,
@@ -111,7 +110,6 @@ class Stream:
         self._raised: BaseException | None = None
         self._kept = NOTHING
         self.other = NOTHING[1]
-        self._unexplained = np.ones(2)
         self._flushed = False
         self.queued = 0
 
@@ -234,10 +232,8 @@ class Stream:
         output, self._state = step(engine, frame, self._state)
         if output.speech_probability is not None:
             self._turns.step(output.spectrum, frame.error, self.front.errors)
-        said, speaking = output.speech_probability, self.barge_in.speaking
-        self._unexplained = UNEXPLAINED_MEMORY * self._unexplained + np.array(output.unexplained)
-        share = 1.0 if speaking else float(self._unexplained[0] / self._unexplained[1])  # who speaks may do so softly
-        human = None if said is None else human_probability(said, share)
+        said = output.speech_probability
+        human = None if said is None else human_probability(said)
         self._judge_speech(human, frame, aligned)
         self.front.hear(frame, output, self.speech_probability, self.barge_in.speaking)
         listen = 1.0 if human is None or self.barge_in.speaking else NOBODY ** (1.0 - human)
@@ -261,7 +257,8 @@ class Stream:
             suspect = frame.at_any_lag or (self._watch is not None and self._watch.suspect)
             wait = self._watch.wait // self.engine.stft.hop if self._watch else 0
             self.speech_probability = 0.0 if suspect else probability
-        if talk := self.barge_in.note(self.speech_probability, wait, self._softer_after(frame, aligned)):
+        heard = not (frame.idle or frame.at_any_lag)
+        if talk := self.barge_in.note(self.speech_probability, wait, self._softer_after(frame, aligned), heard):
             self._tell_of_speech(talk, f"probability {self.speech_probability or 0.0:.2f}")
             if call := self._called.get(talk):
                 try:
@@ -277,7 +274,7 @@ class Stream:
     def _tell_of_speech(self, talk: EventKind, detail: str) -> None:
         if talk == "speech_started":
             self._turns.start(self.barge_in.waited)
-            self._tell(talk, detail, sound=self._turns.recent())
+            self._tell(talk, detail, sound=self._turns.recent(self.barge_in.waited))
         elif talk == "speech_stopped":
             self._tell(talk, detail, self._turns.finish(), self._turns.recent())
             drop_sound(self.events)

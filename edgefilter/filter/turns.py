@@ -17,7 +17,7 @@ LONGEST_S = 30.0
 BEFORE_S = 0.5
 """Of sound before the human was noticed: they had begun to speak, and a recogniser wants some silence first."""
 RECENT_S = 0.3
-"""Seconds of the latest output that an event carries: what a human who was just noticed has said so far, and a syllable before."""
+"""Seconds of output before a beginning or an end of speech that its event carries: the syllable before the human was noticed."""
 LARGEST = 2.0
 """Most that an answer is taken to be over its error in a bin: engines add no sound, but an error can vanish."""
 WAITING_S = 600.0
@@ -63,9 +63,9 @@ class Turns:
         """The turn up to the latest frame, a whole number of hops."""
         return self._since(max(self._begin, self._count - self._room))
 
-    def recent(self) -> Turn:
-        """What came in the last RECENT_S up to the latest frame, or a hop more."""
-        frames = -(-round(RECENT_S * SAMPLE_RATE) // self._stft.hop) + 1  # the latest ends with half a window
+    def recent(self, waited: int = 0) -> Turn:
+        """From RECENT_S, or a hop more, before the frame that came so many frames before the latest, to that."""
+        frames = -(-round(RECENT_S * SAMPLE_RATE) // self._stft.hop) + 1 + waited  # the latest ends with half a window
         return self._since(max(self._count - frames, 0))
 
     def _since(self, first: int) -> Turn:

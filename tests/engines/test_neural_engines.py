@@ -80,23 +80,6 @@ def test_a_model_that_answers_a_probability_beyond_0_to_1_is_held_to_them(tmp_pa
     assert engine.step(heard, engine.initial_state())[0].speech_probability == told
 
 
-def test_the_answer_is_unexplained_where_the_error_is_8_dB_over_what_noise_and_residual_echo_lead_to_expect():
-    engine, rng = Crnn(EDGE), np.random.default_rng(2)
-    *others, error = (spectrum(rng, 257) for _ in range(4))
-    nothing, part, power = np.zeros(257, np.float32), np.float32(0.12), np.abs(error) ** 2
-
-    def told(noise, residual):
-        answer = engine.step(Frame(*others, error, noise, residual), engine.initial_state())[0]
-        return *answer.unexplained, np.abs(answer.spectrum) ** 2
-
-    (all_of_it, every_bin, _), (none, *_) = told(part * power, nothing), told(part * power, part * power)
-    assert all_of_it == pytest.approx(every_bin) and none == 0.0
-    low = np.arange(257) < 100
-    found, every_bin, answer = told(part * power, np.where(low, nothing, part * power))
-    assert found / every_bin == pytest.approx(answer[low].sum() / answer.sum(), rel=1e-5)
-    assert 0.1 < found / every_bin < 0.9
-
-
 @pytest.mark.parametrize(("below_db", "heard"), [(36.0, True), (44.0, False)])
 def test_what_is_far_softer_than_the_robot_has_been_is_nobody_who_interrupts(below_db, heard):
     engine, rng = Crnn(EDGE), np.random.default_rng(3)

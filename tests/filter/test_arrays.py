@@ -255,15 +255,16 @@ def test_a_turn_of_one_microphone_is_what_was_streamed() -> None:
     assert turn.start <= 2.7 * RATE and turn.start + turn.samples.size >= 5 * RATE
 
 
-def test_beginning_and_end_bring_the_last_300_ms_of_what_was_streamed() -> None:
+def test_beginning_and_end_bring_what_was_streamed_from_300_ms_before_speech_was_suspected_or_had_stopped() -> None:
     mic, ref, _ = talk()
     stream = Stream(Told(3 * RATE, 5 * RATE), calibration(1))
     out = np.concatenate((stream.process(mic[:, 0], ref), stream.flush()))
     suspected, *told = [event for event in stream.events if event.kind.startswith("speech")]
     assert suspected.sound is None and [event.kind for event in told] == ["speech_started", "speech_stopped"]
-    for event in told:
+    assert told[0].sample > suspected.sample
+    for event, before in zip(told, (suspected.sample, told[1].sample), strict=True):
         end = event.sound.start + event.sound.samples.size
-        assert end == event.sample - 256 and 0.3 * RATE <= event.sound.samples.size < 0.3 * RATE + 256
+        assert end == event.sample - 256 and 0.3 * RATE <= before - 256 - event.sound.start < 0.3 * RATE + 256
         assert np.array_equal(event.sound.samples, out[event.sound.start : end])
 
 

@@ -10,7 +10,7 @@ from edgefilter import EgoFilter
 from edgefilter.commands.display import say_event
 from edgefilter.engines.linear import Linear
 from edgefilter.errors import UsageError
-from edgefilter.filter.barge_in import ERROR, BargeIn, BargeInSettings, human_probability, log_odds
+from edgefilter.filter.barge_in import ERROR, FALL, BargeIn, BargeInSettings, human_probability, log_odds
 from edgefilter.filter.budget import DEMO
 from edgefilter.filter.stream import Stream
 from edgefilter.types import SAMPLE_RATE, Event, Output
@@ -92,6 +92,50 @@ def test_where_the_robot_lowers_its_voice_what_is_heard_of_the_lower_one_decides
         talk.note(probability, heard_after=round(BargeInSettings.confirm_s / HOP_S) + 1)
         assert not talk.asking  # a lower voice would come too late
     assert talk.speaking
+
+
+def test_a_threshold_is_a_rate_of_false_starts():
+    for rate, threshold in ((16.0, 0.97), (9.0, 0.99)):
+        assert BargeInSettings.at_rate(rate).threshold == pytest.approx(threshold, abs=0.001)
+    asking = BargeInSettings.at_rate(5.0, ask_db=12.0)
+    assert asking == BargeInSettings(threshold=324.0 / 325.0, ask_db=12.0)
+    for rate in (0.0, -1.0, 90.0, float("nan")):
+        with pytest.raises(UsageError, match=f"got {rate} false starts an hour, expected more than 0 and less than 90"):
+            BargeInSettings.at_rate(rate)
+
+
+def suspicions(per_minute: float, minutes: int, robot: bool) -> int:
+    """In the latter half of a robot alone that is taken for a human so often, by exponential odds beyond even ones."""
+    rng, talk = np.random.default_rng(0), BargeIn(HOP_S)
+    hops = round(60 * minutes / HOP_S)
+    moments = rng.random(hops) < per_minute * HOP_S / 60
+    odds = np.where(moments, rng.exponential(FALL, hops), log_odds(UNSURE))
+    told = [talk.note(p, robot=robot) for p in (1.0 / (1.0 + np.exp(-odds))).tolist()]
+    return told[hops // 2 :].count("speech_suspected")
+
+
+def test_a_robot_that_is_often_taken_for_a_human_needs_more_evidence_and_one_that_never_is_less():
+    usual, learned = ([suspicions(rate, 60, robot) for rate in (1.5, 15.0)] for robot in (False, True))
+    assert (
+        usual[1] > 8 * usual[0] and learned[1] < 3 * learned[0]
+    )  # what it learns is held against as long of a usual robot
+    assert learned[0] == pytest.approx(usual[0], rel=0.35)  # some 8 each
+    for quiet, sooner in ((2 * 7500, True), (0, False)):
+        talk = BargeIn(HOP_S)
+        for _ in range(quiet):
+            talk.note(UNSURE, robot=True)
+        assert (talk.note(0.95, robot=True) == "speech_suspected") is sooner
+
+
+def test_what_is_believed_to_be_a_human_is_no_mistake_and_nothing_is_learned_while_the_robot_is_silent():
+    pause = [UNSURE] * 60
+    for said, robot, slower in (([0.9999] * 60, True, False), ([0.9] * 3, False, False), ([0.9] * 3, True, True)):
+        talk = BargeIn(HOP_S)
+        for probability in (said + pause) * 20:
+            talk.note(probability, robot=robot)
+        for _ in range(60):
+            talk.note(0.0)  # whoever spoke has ended
+        assert (talk.note(THRESHOLD) is None) is slower
 
 
 @pytest.mark.parametrize(
@@ -239,6 +283,29 @@ def test_a_robot_that_asks_tells_its_own_voice_from_a_human_by_lowering_it(human
     assert right in kinds and (human or "speech_started" not in kinds)
     lowered = [event.detail for event in stream.events if event.kind == "voice_gain"]
     assert lowered[:2] == ["0.251", "1.000"]
+
+
+class Moments(Linear):
+    """Takes 0.64 s of anything for a human once, not surely, and what is heard from 12 s on more surely."""
+
+    def __init__(self):
+        super().__init__()
+        self.hop = 0
+
+    def step(self, frame, state):
+        self.hop += 1
+        said = 0.98 if self.hop % 40 == 0 else 0.1
+        return Output(frame.mic, 0.9985 if self.hop > 750 else said), state
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("talks", [True, False])
+def test_a_stream_learns_from_the_robot_s_own_voice_and_from_no_other_sound(talks):
+    ref = (0.1 * np.random.default_rng(0).standard_normal(13 * SAMPLE_RATE)).astype(np.float32)
+    mic = 0.5 * np.concatenate((np.zeros(1600, np.float32), ref))[: ref.size]
+    stream = Stream(Moments())
+    stream.process(mic, ref if talks else np.zeros_like(ref))
+    assert any(event.kind == "speech_started" for event in stream.events) is not talks
 
 
 @pytest.mark.slow
