@@ -60,9 +60,10 @@ def speeds(mic: Samples, ref: Samples) -> Iterator[tuple[float, float] | None]:
         moved = (1.0 - part) * heard[whole, first:last] + part * heard[whole + 1, first:last]
         slower[: at.size, first - step : last - step] = moved
         cross = (fourier.rfft(np.ascontiguousarray(slower.T)) * spectra).sum(axis=0)
+        # logarithms of spectra: where any sound overlaps, its energy is thousands
         overlap = (energy[at.size :] - energy[: energy.size - at.size])[:lags]
         correlation = np.roll(fourier.irfft(cross, size)[::-1], 1)[:lags]
-        score[:] = correlation / np.sqrt(np.square(moved).sum() * (overlap + 0.1 * overlap.max()) + fourier.TINY)
+        score[:] = correlation / np.sqrt(np.square(moved).sum() * (overlap + 0.1 * overlap.max()) + 1.0)
         yield None
     yield _best(scores)
 
@@ -72,12 +73,12 @@ def _best(scores: Array) -> tuple[float, float]:
     step, lag = np.unravel_index(scores.argmax(), scores.shape)
     elsewhere = scores.copy()
     elsewhere[max(step - 3, 0) : step + 4, max(lag - ASIDE, 0) : lag + ASIDE + 1] = 0.0
-    peak, between = scores[step, lag], 0.0
+    peak, between = scores[step, lag], 0.0  # over what chance has elsewhere at least, where hardly anything sounds
     if 0 < step < 2 * STEPS:
         low, high = scores[step - 1, lag], scores[step + 1, lag]
         between = 0.5 * (low - high) / min(low - 2.0 * peak + high, -1e-20)
     return float(np.exp(STEP * (step - STEPS + between))), max(
-        float(peak * peak / max(elsewhere.max(), 1e-20)) - CHANCE, 0.0
+        float(peak * peak / max(elsewhere.max(), CHANCE**2)) - CHANCE, 0.0
     )
 
 

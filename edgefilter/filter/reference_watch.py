@@ -146,12 +146,12 @@ class ReferenceWatch:
             self._off_speed, self._seen_speeds, self._speeds = False, [(0.0, CLEAR)], iter(())
             return ""
         heard, ref, onsets = aligned.past
-        self._to_compare -= self._hop * onsets.active
+        self._to_compare = LENGTH if self._idle else self._to_compare - self._hop * onsets.active
         found = next(self._speeds, False)
         if not isinstance(found, tuple):  # a look is under way, or none is
+            start = ref.end - AHEAD - LENGTH
             if found is False and onsets.active and self._to_compare <= 0 < self._looks_left:
                 self._to_compare, self._looks_left = SPEED_STRIDE, self._looks_left - 1
-                start = ref.end - AHEAD - LENGTH
                 self._speeds = speeds(heard.read(start, start + LENGTH), ref.read(start - BEHIND, ref.end))
                 next(self._speeds)  # while both are as they were read
             return ""

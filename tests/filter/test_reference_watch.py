@@ -15,6 +15,7 @@ from edgefilter.alignment.belief import Belief
 from edgefilter.alignment.delay_line import DelayBuffer
 from edgefilter.alignment.utterances import OnsetDetector
 from edgefilter.filter.barge_in import BargeIn
+from edgefilter.filter.playback_faults import AHEAD, BEHIND, CHANCE, LENGTH, speeds
 from edgefilter.filter.reference_watch import ReferenceWatch
 from edgefilter.filter.removal import Removal
 from edgefilter.profile.data import Profile
@@ -345,3 +346,11 @@ def test_an_utterance_that_is_found_in_the_end_is_not_said_to_be_unfound_hop_aft
     for aligned in [*[begun._replace(belief=nothing)] * 8, *[begun._replace(state="locked")] * 8]:
         said.append(watch.step(0.1 * hop, 0.1 * hop, aligned, SILENT_FRAME, Removal(1600), False))
     assert [kind for found in said for kind, _ in found] == ["robot_unfound"]
+
+
+def test_where_hardly_anything_sounds_a_speed_is_not_clear_beyond_all_bounds():
+    """Nothing was anywhere else, and the ratio to it 4e10."""
+    mic, ref = np.zeros(LENGTH, np.float32), np.zeros(BEHIND + LENGTH + AHEAD, np.float32)
+    mic[-3000:], ref[-3000:] = np.random.default_rng(0).standard_normal((2, 3000)) / 10
+    *_, (_, clear) = speeds(mic, ref)
+    assert clear < 1.0 / CHANCE**2
