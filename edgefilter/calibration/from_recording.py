@@ -260,8 +260,8 @@ def others(target: Samples, predicted: Samples) -> list[tuple[float, float]]:
 
 def _warnings(seconds: float, talk: list[tuple[float, float]]) -> list[str]:
     told = [
-        "no calibration: a gain, a band limit, a resonance, the room's reverberation and another fan are part of what is"
-        " measured here and cannot be told"
+        "no calibration: path and fan are measured in this recording itself, so a gain, a band limit, a resonance, the"
+        " room's reverberation and a changed fan cannot be told from it"
     ]
     if seconds == 0.0:
         told.append("the robot is hardly silent here: the quietest moments of the recording stand for the fan")

@@ -111,7 +111,8 @@ class Workbench:
     ) -> None:
         self.recording, self.criteria = recording, criteria
         self._start = start or recording.model
-        # what the start has at neutral values is in what was measured (self_calibrate): no search claims it
+        # a profile made from the recording itself (self_calibrate) has effects at neutral values: its path or fan already
+        # holds them, so that they are not tried
         taken_up = (name for name, values in self._start.effects if vanishes(find(name), values))
         self._without = {*without, *taken_up}
         self._progress = progress

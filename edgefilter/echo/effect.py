@@ -125,11 +125,14 @@ class Effect:
         return np.full(601, 1.0 / 8000.0)
 
     def passed(self, noise: Samples, voice: Samples, values: Values, sample_rate: int) -> Samples:
-        """What is heard of the fan's sound (n,) beside a voice (n,): not all behind a gain by level, another one before the fan has changed."""
+        """The fan's sound (n,), given as it is at the end of the recording without this effect, as it is heard beside a voice (n,).
+
+        A gain by level behind the microphone turns it down; a fan that changed later on sounded differently before. By default as given.
+        """
         return noise
 
     def elsewhere(self, values: Values) -> Values | None:
-        """The values that hold in other recordings; None, by default of an event: there it is left out."""
+        """The values to use in other recordings than the one they were fitted to; None to leave the effect out, as by default of an event."""
         return None if self.event else values
 
     def sentence(self, values: Values) -> str:

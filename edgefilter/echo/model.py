@@ -206,7 +206,7 @@ class EchoModel:
         return self._as_in((0.0, measurement.fingerprint))
 
     def _as_in(self, recordings: Sequence[float]) -> EchoModel:
-        """The model as it is in these recordings, known by their fingerprints; itself where nothing changes."""
+        """The model without what was fitted to other recordings than those with these fingerprints; itself where there is nothing of that kind."""
         known = [(n, v if v.get(RECORDING.name) in recordings else find(n).elsewhere(v)) for n, v in self.effects]
         effects = tuple((name, values) for name, values in known if values is not None)
         same = len(effects) == len(self.effects) and all(

@@ -27,7 +27,8 @@ USUAL_S, LEARNED_S = 40.0, 120.0
 how often it is, beside as many of a usual robot. Most of 200 simulated robots (12 s each) and 8 of 14 real devices never are, some
 every second or two: once in 13 s in the mean. Of simulated robots, and of real humans in time, 20 s and a minute give as many."""
 FALL = 2.0
-"""Log-odds by which such moments become e times as rare: 1.8 to 2.6 above any level from 1 to 3, real and simulated."""
+"""Rise of a threshold, in log-odds, that makes it e times as rare that a robot which talks alone exceeds it: 1.8 to 2.6 measured at
+thresholds from 1 to 3, of real and simulated robots."""
 UNASKED = 1e-4
 """Error rate of that test, log-odds of 9.2, at which a calibrated robot believes in a human without waiting for its lower voice to be
 heard. 124 simulated robots alone (recipe `field`, 25 minutes, closed loop): no sum that the lower voice has dismissed exceeded

@@ -32,7 +32,7 @@ converter, since there is nothing else to compare with. 16 bits by themselves ar
 FELL_SILENT = 1e-3
 """Power of the reference, over its power while the robot talks, below which it is silent, -30 dB: the noise of a loopback is."""
 SPEED_STRIDE, SPEED_LOOKS = SAMPLE_RATE, 8
-"""Samples of speech between two looks at the speed, and how many there are at most: the echo is not found meanwhile."""
+"""Samples of the robot's speech between two looks at the speed, and the most looks. There are looks only while the echo is not found."""
 SAME_S = 2.0
 """Seconds of sound after which microphone and reference are compared sample by sample."""
 Verdict = Literal["unknown", "fits", "late"]
@@ -56,7 +56,9 @@ class ReferenceWatch:
         self._late = 0
         self._missing, self._grew, self._another = "", False, False
         self._off_speed = False
-        self._seen_speeds: list[tuple[float, float]] = []  # logarithm of what each look has found, and how clearly
+        self._seen_speeds: list[
+            tuple[float, float]
+        ] = []  # of each look: logarithm of the speed found, and its clearness
         self._speeds: Iterator[tuple[float, float] | None] = iter(())  # of the look that is under way
         self._to_compare, self._looks_left = LENGTH, SPEED_LOOKS
         self._idle = True

@@ -29,9 +29,10 @@ TAIL_DECAY = 0.6
 MISALIGNMENT_WARM, MISALIGNMENT_COLD = 0.5, 2.0
 """Weight of the canceller's estimate of its misalignment: too large for a calibrated path, too small from nothing."""
 WITH_VOICE_MEMORY, WITH_VOICE_RISE, WITH_VOICE_HELD = 0.98, 1.05, 0.9
-"""What else sounds while the robot talks, such as motors, is observed over .8 s, and rises by 13 dB a second at most, so that what a
-human says before they are noticed hardly lifts it. It goes with the loudest of the echo, which falls by .5 dB a hop: motors stop
-more slowly than words. Of 48 false starts beside the motors of 20 simulated robots (11 minutes) 19 are left."""
+"""The noise that sounds with the robot's voice but is no echo, such as motors, is averaged over .8 s, and the estimate rises by 13 dB a
+second at most, so that a human who has not been noticed yet hardly raises it. It is expected in proportion to the echo's running
+peak, which falls by .5 dB a hop, since motors stop more slowly than words. Of 48 false starts beside the motors of 20 simulated
+robots (11 minutes in all) 19 are left."""
 WITH_VOICE_MARGIN = 2.0
 """Power of that over what is observed: a sound of motors goes up and down. With 3 one false start less is left, and a
 filter that starts three seconds before a soft human notices them .15 s later."""

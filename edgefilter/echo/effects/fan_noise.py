@@ -97,7 +97,7 @@ class FanNoise(Effect):
 
 
 def _swings(heard: Array, expected: Array) -> bool:
-    """Whether periodograms (f, b) are at times louder, and at times softer, than a density (b,)."""
+    """Whether the levels of periodograms (f, b), over a density (b,), differ among each other by more than STEADY_DB; one answer for all."""
     return bool(np.ptp(np.quantile(_levels_db(heard, expected), (0.1, 0.9))) > STEADY_DB)
 
 
@@ -107,7 +107,7 @@ def _levels_db(heard: Array, expected: Array) -> Array:
 
 
 def _turn(heard: Samples, was: Array) -> int:
-    """From which of periodograms (f, b) on they are likeliest to lie around a mean of their own, until then around was (b,); 0 for none."""
+    """The likeliest index, of periodograms (f, b), from which they lie around another density than was (b,); 0 where they are too few."""
     rest = np.arange(len(heard), 0, -1)
     after = np.cumsum(heard[::-1], axis=0)[::-1] / rest[:, None]
     before = np.cumsum(np.sum(np.log(was) + heard / was, axis=1))[:-1]
