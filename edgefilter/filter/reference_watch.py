@@ -56,9 +56,8 @@ class ReferenceWatch:
         self._late = 0
         self._missing, self._grew, self._another = "", False, False
         self._off_speed = False
-        self._seen_speeds: list[
-            tuple[float, float]
-        ] = []  # of each look: logarithm of the speed found, and its clearness
+        # of each look: logarithm of the speed found, and its clearness
+        self._seen_speeds: list[tuple[float, float]] = []
         self._speeds: Iterator[tuple[float, float] | None] = iter(())  # of the look that is under way
         self._to_compare, self._looks_left = LENGTH, SPEED_LOOKS
         self._idle = True

@@ -42,7 +42,7 @@ class FanNoise(Effect):
 
     def passed(self, noise: Samples, voice: Samples, values: Values, sample_rate: int) -> Samples:
         start = round(first(values, "from_s") * sample_rate)
-        if not 0 < start:
+        if start == 0:
             return noise
         taps = np.fft.irfft(10.0 ** (-np.broadcast_to(values["spectrum_db"], GRID_BINS) / 20.0))
         before = filtered(noise[:start], np.roll(taps, GRID_BINS - 1), GRID_BINS - 1)
