@@ -34,6 +34,8 @@ AUDIO = (".wav", ".flac", ".ogg")
 KINDS = ("doubletalk", "farend", "nearend")
 SPANS = {"doubletalk": "double_talk_s", "farend": "far_end_alone_s", "nearend": "near_end_alone_s"}
 """Columns of files.tsv with the seconds in which these talk."""
+WAKE_WORD = "wake word"
+"""Where the note in files.tsv names one, somebody says it while the robot talks."""
 LENGTHS_S = 1.0
 """Seconds by which a loopback may differ from its microphone: recorders of real devices stop one after the other."""
 UTTERANCE_S = (3.0, 10.0)
@@ -234,6 +236,8 @@ def _told(folder: Path) -> dict[str, dict[str, tuple[int, int] | None]]:
             seconds = {
                 kind: [float(s) for s in row[column].split("-")] for kind, column in SPANS.items() if row.get(column)
             }
+            if WAKE_WORD in (row.get("note") or "") and "farend" in seconds:
+                seconds = {"doubletalk": seconds["farend"]}
             if place in ("", folder.name):
                 found[name] = {kind: (0 if kind == "doubletalk" else round(start * SAMPLE_RATE), round(end * SAMPLE_RATE))
                                for kind, (start, end) in seconds.items()}  # fmt: skip

@@ -2,6 +2,7 @@
 
 from .calibration.calibrate import calibrate as calibrate
 from .calibration.from_recording import self_calibrate as self_calibrate
+from .calibration.moving import calibrate_moving as calibrate_moving
 from .calibration.multisine import calibrate_multisine as calibrate_multisine
 from .calibration.multisine import generate_multisine as generate_multisine
 from .calibration.sweep import generate_sweep as generate_sweep
@@ -40,6 +41,7 @@ from .learning.background import BackgroundLearner as BackgroundLearner
 from .learning.path_learner import PathLearner as PathLearner
 from .profile.approximation import LinearApproximation as LinearApproximation
 from .profile.data import Profile as Profile
+from .profile.while_moving import WhileMoving as WhileMoving
 from .types import SAMPLE_RATE as SAMPLE_RATE
 from .types import Event as Event
 from .types import Stats as Stats

@@ -180,6 +180,8 @@ def _calibrate(commands: argparse._SubParsersAction) -> None:
     option("--mic-channels", **MIC_CHANNELS)
     told = "multisines at three levels follow the sweep: measure the robot's distortion too"
     option("--multisine", action="store_true", help=told)
+    told = "MIC: the robot, which talks and moves while nobody else speaks; REF: what it says (with --live: neither)"
+    option("--while-moving", nargs="*", metavar="MIC REF", help=told)
     _live(option, "play the sweep on --speaker and record it on --input")
     level = number(-90.0, 0.0, "a level from -90 to 0 dB of full scale", closed=True)
     told = "peak of the played sweep, dB of full scale (default: %(default)s)"

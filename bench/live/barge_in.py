@@ -261,7 +261,7 @@ def monologues(
         def made(index: int = index, voice: str = voice, own: object = own) -> dict:
             return monologue(make_monologue(seed, index, voice, own, length), engine, ask_db)
 
-        rows.append(kept.get(made, of, "monologue", index, length))
+        rows.append(kept.get(made, of, "robot alone", index, length))
         taken[voice] += len(rows[-1]["said"])
     return rows
 
@@ -292,7 +292,14 @@ def stops(talk: Output, speech_s: float) -> dict:
     """How often the robot was stopped by itself, and how often it would have been at each of THRESHOLDS."""
     at_each = [starts(replay(talk.probability, talk.hop, at)) for at in THRESHOLDS]
     asked = sum(event.kind == "voice_gain" and float(event.detail) < 1.0 for event in talk.events)
-    return {"speech_s": speech_s, "stops": starts(talk.events), "stops_at": at_each, "asked": asked}
+    suspected = sum(event.kind == "speech_suspected" for event in talk.events)
+    return {
+        "speech_s": speech_s,
+        "stops": starts(talk.events),
+        "stops_at": at_each,
+        "suspected": suspected,
+        "asked": asked,
+    }
 
 
 def run(options: argparse.Namespace) -> str:
@@ -351,8 +358,9 @@ def tables(rows: Sequence[Mapping], alone: Sequence[Mapping], points: Mapping[st
                       " syllables, the coughs are bursts of noise: stand-ins, not recordings of either."),
         results.table("false-stops", "False stops",
                       ["loudspeaker, filter", "robots", ("minutes of speech", 1), ("distinct", 1), "voices", "stops", ("an hour", 1),
-                       "asked"],
-                      [[name, *false_stops(part)] for name, part in groups(alone).items() if part]),
+                       "suspected", "asked"],
+                      [[name, *false_stops(part)] for name, part in groups(alone).items() if part],
+                      "Suspected, but not asked: while the robot is silent, or where a lower voice would be heard too late."),
         results.table("threshold", "By the threshold of the probability, simulated robots",
                       ["filter", "threshold", (f"within {IN_TIME_S} s, %", 0), ("false stops an hour", 1)],
                       [[start, point["threshold"], 100 * point["in_time"], point["per_hour"]]
@@ -397,11 +405,11 @@ def synthesiser(voice: str) -> str:
 
 
 def false_stops(rows: Sequence[Mapping]) -> list:
-    """Robots, minutes of speech and of distinct speech, voices, stops, stops an hour with the exact Poisson interval, and how often it asked."""
+    """Robots, minutes of speech and of distinct speech, voices, stops, those an hour with the exact Poisson interval, suspicions, asked."""
     hours, count = sum(row["speech_s"] for row in rows) / 3600, sum(row["stops"] for row in rows)
     distinct_s = sum({name: seconds for row in rows for name, seconds in row["said"]}.values())
     return [len(rows), 60 * hours, distinct_s / 60, len({row["voice"] for row in rows}), count, per_hour(count, hours),
-            sum(row["asked"] for row in rows)]  # fmt: skip
+            *(sum(row[what] for row in rows) for what in ("suspected", "asked"))]  # fmt: skip
 
 
 def curve(found: Sequence[Mapping], alone: Sequence[Mapping], start: str) -> list[dict]:

@@ -15,7 +15,9 @@ from edgefilter.errors import EdgefilterError, UsageError
 
 RECORDINGS = ("sweep_reference", "sweep_recording", "noise_recording")
 """Of a calibration: its options, and the files that it records."""
-READ = ("input", "reference", "play", "profile", "model", "recording", "effects", *RECORDINGS, "token")
+MOVING = ("moving_recording", "moving_reference")
+"""Further files that a calibration records of a robot that moves."""
+READ = ("input", "reference", "play", "profile", "model", "recording", "effects", *RECORDINGS, "while_moving", "token")
 """Options that may name a file to read; a name that is no file, such as a device's, cannot be overwritten."""
 WRITTEN = (
     *("output", "excitation", "json", "report", "save_profile", "learn", "apply", "write_effect"),
@@ -34,7 +36,7 @@ HIDDEN_FILES = (
 FOLDERS: dict[tuple[str, str], tuple[str, ...]] = {
     ("run", "record"): ("mic.wav", "reference.wav", "output.wav", "events.jsonl", "run.json", "profile.npz"),
     ("run", "turns"): ("turn_0001.wav",),
-    ("calibrate", "save_input"): tuple(f"{name}.wav" for name in RECORDINGS),
+    ("calibrate", "save_input"): tuple(f"{name}.wav" for name in (*RECORDINGS, *MOVING)),
     ("ros2", "output"): ("mic.wav", "reference.wav"),
     ("demo", "output"): (
         *("filtered.wav", "microphone.wav", "human.wav", "before_after.png"),

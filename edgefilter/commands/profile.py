@@ -38,6 +38,8 @@ def summary(profile: Profile) -> dict[str, object]:
         ],
         "distortion_db": {str(order): float(level) for order, level in enumerate(profile.distortion_db, start=2)},
         "levels": [] if profile.approximation is None else levels(profile.approximation),
+        "while_moving": profile.while_moving
+        and {name: getattr(profile.while_moving, name) for name in ("level_db", "moments", "seconds")},
         "warnings": list(profile.warnings),
         "created": profile.created,
         "source": profile.source,

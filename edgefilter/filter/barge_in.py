@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias, get_args
 
 from edgefilter.errors import UsageError
+from edgefilter.profile.while_moving import WhileMoving
 from edgefilter.types import EventKind
 
 Judge: TypeAlias = Literal["engine", "network"]
@@ -98,14 +99,24 @@ class OwnVoice:
     """Learns how often a robot is taken for a human, and so which odds tell a human from this one.
 
     Moments with more than even odds that end without a human are counted while the robot is heard. Their rate has a gamma distribution,
-    a priori that of LEARNED_S of a usual robot (Gelman et al., "Bayesian data analysis", 2.6). higher: log-odds by which a human must
-    be more likely than beside a usual robot, so that this one is suspected as rarely. hop_s: seconds between two hops.
+    a priori that of LEARNED_S of a usual robot (Gelman et al., "Bayesian data analysis", 2.6). hop_s: seconds between two hops.
+    before: what its calibration has counted.
     """
 
-    def __init__(self, hop_s: float) -> None:
-        self._memory, self._before = LEARNED_S / hop_s, LEARNED_S / USUAL_S
+    def __init__(self, hop_s: float, before: WhileMoving | None = None) -> None:
+        self._hop_s, self._memory, self._usual = hop_s, LEARNED_S / hop_s, LEARNED_S / USUAL_S
         self._even = self._apart = round(BargeInSettings.confirm_s / hop_s)
-        self._hops = self._peaks = self.higher = 0.0
+        self._peaks, self._hops = (before.moments, before.seconds / hop_s) if before else (0.0, 0.0)
+
+    @property
+    def higher(self) -> float:
+        """Log-odds by which a human must be more likely than beside a usual robot, so that this one is suspected as rarely."""
+        return FALL * math.log((1.0 + self._peaks / self._usual) / (1.0 + self._hops / self._memory))
+
+    @property
+    def counted(self) -> tuple[float, float]:
+        """So many moments in so many seconds, both as far as they are remembered."""
+        return self._peaks, self._hops * self._hop_s
 
     def note(self, odds: float, open_: bool) -> None:
         """Take the log-odds of a hop in which nobody is believed to speak. open_: whether somebody is suspected to."""
@@ -116,7 +127,6 @@ class OwnVoice:
         elif not open_ or self._even + 1 < self._apart:
             self._even += 1
             self._peaks += self._even == self._apart
-        self.higher = FALL * math.log((1.0 + self._peaks / self._before) / (1.0 + self._hops / self._memory))
 
     def believed(self) -> None:
         """What was heard is a human."""
@@ -133,18 +143,25 @@ class BargeIn:
     bound of UNASKED, or where speech goes on once the lower voice is heard at the microphone: from that moment on the sum begins
     anew and never falls below 0 (Page 1954, "Continuous inspection schemes"); if it does not reach the upper bound within
     the time to confirm, it was the robot.
-    hop_s: seconds between two probabilities. settings: None for the defaults. calibrated: whether the robot is.
+    hop_s: seconds between two probabilities. settings: None for the defaults. calibrated: whether the robot is, and before: with what
+    count of `own`, the rate at which it is taken for a human.
 
     >>> talk = BargeIn(0.016)
     >>> [talk.note(probability) for probability in (0.2, 0.98, 0.99, 0.995, 0.995)]
     [None, 'speech_suspected', None, 'speech_started', None]
     """
 
-    def __init__(self, hop_s: float, settings: BargeInSettings | None = None, calibrated: bool = False) -> None:
+    def __init__(
+        self,
+        hop_s: float,
+        settings: BargeInSettings | None = None,
+        calibrated: bool = False,
+        before: WhileMoving | None = None,
+    ) -> None:
         self.settings = settings = settings or BargeInSettings()
         self._pause = max(1, round(settings.min_silence_s / hop_s))
         self._longest = round(settings.confirm_s / hop_s)
-        self._own = OwnVoice(hop_s)
+        self.own = OwnVoice(hop_s, before)
         self._threshold = self._needed = log_odds(settings.threshold)
         self._bound, self._sure = log_odds(1.0 - ERROR), log_odds(1.0 - UNASKED) if calibrated else math.inf
         self._silent = 0
@@ -189,15 +206,15 @@ class BargeIn:
         probability, before = probability or 0.0, self._certain
         told = self._judge(probability, wait, heard_after)
         if before or self._certain:
-            self._own.believed()
+            self.own.believed()
         elif robot:
-            self._own.note(log_odds(probability), self._hops > 0)
+            self.own.note(log_odds(probability), self._hops > 0)
         return told
 
     def _judge(self, probability: float, wait: int, heard_after: int) -> EventKind | None:
         self._silent = self._silent + 1 if probability < self.settings.release else 0
         if not self._hops:
-            self._needed = self._threshold + self._own.higher
+            self._needed = self._threshold + self.own.higher
             if log_odds(probability) < self._needed:
                 return None
         if not self._hops and heard_after <= self._longest:

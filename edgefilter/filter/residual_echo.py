@@ -85,7 +85,7 @@ class Residual:
     What else sounds with the voice, in any bin (motors), is followed as a part of the echo's whole power while it is known
     that no human speaks.
 
-    nobody_speaks: whether that is known; set by who hears the answer.
+    nobody_speaks: whether that is known; set by who hears the answer. with_voice: (bins,), that part, as in `WhileMoving`.
     """
 
     def __init__(self, stft: StftConfig, profile: Profile | None = None) -> None:
@@ -99,7 +99,8 @@ class Residual:
         known = profile.approximation if profile is not None else None
         self._leakage = LEAKAGE if known is None else _within(BOUNDS, known.share)
         self._left = self._brought = 0.0
-        self._with_voice, self._loudest = np.zeros(self._bins, np.float32), 0.0
+        moving, self._loudest = profile and profile.while_moving, 0.0
+        self.with_voice = moving.with_voice(stft) if moving else np.zeros(self._bins, np.float32)
         self._tracked = NoiseTracker(self._bins)
         before = self._spread.size // 2  # beyond its ends the echo counts as what it is there
         self._extended = np.zeros(self._bins + self._spread.size - 1, np.float32)
@@ -142,7 +143,7 @@ class Residual:
         self._loudest = max(loud, WITH_VOICE_HELD * self._loudest)
         if self.nobody_speaks and self._loudest > AUDIBLE * noise_power:
             self._follow(observed - noise - brought)
-        brought += np.float32(WITH_VOICE_MARGIN * self._loudest) * np.maximum(self._with_voice, np.float32(0.0))
+        brought += np.float32(WITH_VOICE_MARGIN * self._loudest) * np.maximum(self.with_voice, np.float32(0.0))
         return noise, brought
 
     def _follow(self, left: Samples) -> None:
@@ -151,9 +152,9 @@ class Residual:
         Below zero as well: the noise goes up and down, and of its excess alone a third of it would be learned.
         """
         part = left / np.float32(self._loudest)
-        most = np.float32(WITH_VOICE_RISE) * np.maximum(self._with_voice, np.float32(LEAKAGE / self._bins))
-        self._with_voice += np.float32(1.0 - WITH_VOICE_MEMORY) * (part - self._with_voice)
-        np.minimum(self._with_voice, most, out=self._with_voice)
+        most = np.float32(WITH_VOICE_RISE) * np.maximum(self.with_voice, np.float32(LEAKAGE / self._bins))
+        self.with_voice += np.float32(1.0 - WITH_VOICE_MEMORY) * (part - self.with_voice)
+        np.minimum(self.with_voice, most, out=self.with_voice)
 
     def _track(self, left: float, brought: float) -> None:
         """Follow the leakage. left: error power beyond noise and unknown echo; brought: power of the echo."""

@@ -97,8 +97,8 @@ class Stream:
         self._watch = ReferenceWatch(stft.hop, stft.bins) if self.front.linear_stage else None
         self.events: deque[Event] = deque(maxlen=1000)
         self.speech_probability: float | None = None
-        calibrated = self.profile is not None and not self.profile.learned
-        self.barge_in = BargeIn(stft.hop / SAMPLE_RATE, self._barge_in_settings, calibrated)
+        calibrated, moving = (not self.profile.learned, self.profile.while_moving) if self.profile else (False, None)
+        self.barge_in = BargeIn(stft.hop / SAMPLE_RATE, self._barge_in_settings, calibrated, moving)
         self._turns = Turns(stft, self.front.spatial)
         self._removed: deque[Samples] = deque(maxlen=round(LONGEST_S * SAMPLE_RATE / stft.hop))
         self.samples_in = self.samples_out = self._stepped = 0

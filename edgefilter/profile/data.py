@@ -19,6 +19,7 @@ from edgefilter.errors import ProfileError, printable
 from edgefilter.profile.approximation import LinearApproximation
 from edgefilter.profile.array import ArrayCalibration
 from edgefilter.profile.file import REMEDY, Effects, check_array, read_fields, refuse, write_fields
+from edgefilter.profile.while_moving import WhileMoving
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 GRID_HZ = np.arange(GRID_BINS) * SAMPLE_RATE / GRID_FFT
@@ -66,6 +67,8 @@ class Profile:
         What a linear path leaves of the robot at several levels, where it was calibrated with multisines.
     array : ArrayCalibration, optional
         The further microphones, where it was calibrated with several; all else is of the first one.
+    while_moving : WhileMoving, optional
+        What sounds with the voice, where the calibration has heard the robot talk and move.
 
     Raises
     ------
@@ -95,6 +98,7 @@ class Profile:
     source: str = ""
     approximation: LinearApproximation | None = None
     array: ArrayCalibration | None = None
+    while_moving: WhileMoving | None = None
 
     def __post_init__(self) -> None:
         arrays = self._arrays()
@@ -140,7 +144,7 @@ class Profile:
             Where it cannot be written.
         """
         arrays = self._arrays()
-        for part in (self.approximation, self.array):
+        for part in (self.approximation, self.array, self.while_moving):
             arrays |= part.arrays() if part else {}
         header = {
             "pre_roll": PRE_ROLL,
@@ -173,7 +177,11 @@ class Profile:
         """
         arrays, header, effects = read_fields(Path(path))
         try:
-            approximation, array = LinearApproximation.taken_from(arrays), ArrayCalibration.taken_from(arrays)
+            parts: dict[str, Any] = {
+                "approximation": LinearApproximation.taken_from(arrays),
+                "array": ArrayCalibration.taken_from(arrays),
+                "while_moving": WhileMoving.taken_from(arrays),
+            }
             known = {"pre_roll", "delay", "sample_rate", "warnings", "created", "source"}
             for kind, found, names in (("array", arrays, {*_ARRAYS, "impulse_response"}), ("header", header, known)):
                 if set(found) != names:
@@ -194,7 +202,7 @@ class Profile:
                 "warnings": told,
             }  # what type each has is checked on construction
             echo = EchoModel(fields.pop("impulse_response"), effects)
-            profile = cls(echo=echo, approximation=approximation, array=array, **fields)
+            profile = cls(echo=echo, **parts, **fields)
             _check_effects(echo)
             return profile
         except ProfileError as error:

@@ -9,6 +9,7 @@ from edgefilter.dsp.psd import total_power
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.profile.approximation import LinearApproximation
 from edgefilter.profile.data import DISTORTION_ORDERS, Profile
+from edgefilter.profile.while_moving import WhileMoving
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 
@@ -32,6 +33,7 @@ def describe(profile: Profile) -> str:
         f"fan         {fan:.1f} dB of full scale",
         f"distortion  orders {distortion}",
         *(_left_lines(profile.approximation) if profile.approximation else ()),
+        *([_moving_line(profile.while_moving)] if profile.while_moving else ()),
         "signal-to-noise ratio of the sweep, by third octave",
     ]
     for (low, high), snr in zip(profile.band_hz, profile.band_snr_db, strict=True):
@@ -71,6 +73,13 @@ def _left_lines(known: LinearApproximation) -> list[str]:
     softer = ", ".join(f"{below[i]:.0f} dB softer {left[i]:.0f}" for i in reversed(range(left.size - 1)))
     lines.append(f"volume      at this volume the path leaves {left[-1]:.0f} dB{'; ' if softer else ''}{softer}")
     return lines
+
+
+def _moving_line(heard: WhileMoving) -> str:
+    return (
+        f"moving      what sounds with the voice is {-heard.level_db:.0f} dB below it, taken for a human {heard.moments:.0f} times in"
+        f" {heard.seconds:.0f} s"
+    )
 
 
 def to_come(path: Samples) -> Array:

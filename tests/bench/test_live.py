@@ -359,8 +359,15 @@ def test_no_stop_in_half_an_hour_says_at_most_seven_an_hour() -> None:
         "neural",
         "real",
     ]
-    row = {"speech_s": 1800.0, "stops": 0, "asked": 2, "said": [["a", 900.0], ["a", 900.0]], "voice": "v"}
-    robots, minutes, distinct, voices, count, rate, asked = barge_in.false_stops([row])
-    assert (robots, minutes, distinct, voices, count, asked) == (1, 30.0, 15.0, 1, 0, 2)
+    row = {
+        "speech_s": 1800.0,
+        "stops": 0,
+        "suspected": 3,
+        "asked": 2,
+        "said": [["a", 900.0], ["a", 900.0]],
+        "voice": "v",
+    }
+    robots, minutes, distinct, voices, count, rate, *asked = barge_in.false_stops([row])
+    assert (robots, minutes, distinct, voices, count, asked) == (1, 30.0, 15.0, 1, 0, [3, 2])
     assert rate["mean"] == rate["low"] == 0.0
     assert rate["high"] == pytest.approx(3.689 / 0.5, abs=0.01)  # the exact bound of a count of 0, Garwood 1936

@@ -69,6 +69,15 @@ def test_a_table_says_who_talks_when_and_the_first_of_several_microphones_is_hea
     assert {one.span for one in find_recordings(pairs) if one.device == "device1"} == {None}
 
 
+def test_a_robot_over_which_a_wake_word_is_said_does_not_talk_alone(pairs: Path) -> None:
+    (pairs / "files.tsv").write_text(
+        "name\tfar_end_alone_s\tnote\nx_farend_singletalk\t1-6\tphone; wake word every 2.7 s\ndevice1_00\t1-6\tphone\n"
+    )
+    found = {one.name: (one.kind, one.span) for one in find_recordings(pairs)}
+    assert found["x_farend_singletalk"] == ("doubletalk", (0, 6 * RATE))
+    assert found["device1_00"] == ("farend", (RATE, 6 * RATE))
+
+
 def test_the_same_seed_lays_the_same_humans(pairs: Path, speech: Path) -> None:
     assert laid(pairs, speech) == laid(pairs, speech) != laid(pairs, speech, seed=4)
 

@@ -128,6 +128,7 @@ def every_pair():
     """(command, inputs, output option) for each command: whatever it reads against whatever it writes."""
     alone = ["--profile", "robot.npz", "--recording", "mic.wav", "--reference", "reference.wav", "--effects", "own.py"]
     sweep = ["--sweep-reference", "mic.wav", "--sweep-recording", "reference.wav", "--noise-recording", "robot.npz"]
+    moving = [*sweep, "--while-moving", "mic.wav", "reference.wav"]
     filtered = ["--input", "mic.wav", "--reference", "reference.wav", "--profile", "robot.npz", "--effects", "own.py"]
     for name, given, outputs in (
         ("compare", alone, ("--json", "--report")),
@@ -135,6 +136,7 @@ def every_pair():
         ("add playback_gain", alone, ("--json", "--output")),
         ("remove playback_gain", ["--profile", "robot.npz", "--effects", "own.py"], ("--json", "--output")),
         ("calibrate", sweep, ("--json", "--output")),
+        ("calibrate", moving, ("--output",)),
         ("profile show", ["robot.npz", "--effects", "own.py"], ("--json", "--plot")),
         ("run", filtered, ("--json", "--output", "--save-profile", "--learn")),
     ):

@@ -93,6 +93,7 @@ class Known:
 
     share: float
     fan: np.ndarray
+    while_moving: None = None
 
     @property
     def approximation(self) -> Known:

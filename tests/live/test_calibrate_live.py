@@ -34,12 +34,15 @@ def test_live_calibration_measures_the_virtual_room(server, tmp_path):
         ["pactl", "load-module", "module-loopback", "source=robot.monitor", "sink=robot_mic", "latency_msec=30"],
         env=server.environment, check=True, capture_output=True,
     )  # fmt: skip
-    figures, said = figures_of(calibrating(server, tmp_path, "--save-input", tmp_path / "kept"), tmp_path)
+    asked = "--save-input", tmp_path / "kept", "--while-moving"
+    figures, said = figures_of(calibrating(server, tmp_path, *asked), tmp_path)
     assert figures["delay_samples"] > 0
     middle = [band["snr_db"] for band in figures["bands"] if 200 < band["low_hz"] < 5000]
     assert min(middle) > 30  # there is no fan: 16-bit rounding is all the noise
     assert said[:2] == ["now quiet: 5 s of the robot's noise alone", "now playing: 8 s of a sweep"]
-    assert len(list((tmp_path / "kept").glob("*.wav"))) == 3
+    assert "now talking: 16 s of a voice; let the robot move as it does when it talks" in said
+    assert len(list((tmp_path / "kept").glob("*.wav"))) == 5
+    assert figures["while_moving"]["seconds"] > 5 and figures["while_moving"]["level_db"] < -40  # nothing moves
 
 
 def test_live_calibration_by_multisines_finds_no_distortion_where_there_is_none(server, tmp_path):

@@ -17,6 +17,7 @@ from edgefilter.errors import ProfileError
 from edgefilter.profile.approximation import LinearApproximation
 from edgefilter.profile.data import GRID_BINS, GRID_HZ, Profile
 from edgefilter.profile.file import read_fields, write_fields
+from edgefilter.profile.while_moving import WhileMoving
 from edgefilter.types import PRE_ROLL
 
 FIELDS = ("response", "noise_psd", "band_hz", "band_snr_db", "distortion_db")
@@ -449,16 +450,48 @@ def known_levels():
     return LinearApproximation(np.array([-26.0, -20.0]), *[density] * 3, -density / 9, density, np.array([-40.0, -46]))
 
 
-def test_what_a_linear_path_leaves_is_kept_and_a_part_of_it_is_refused(tmp_path):
+def known_motors():
+    return WhileMoving(np.linspace(-1e-7, 1e-5, GRID_BINS, dtype=np.float32), 2.5, 14.25)
+
+
+@pytest.mark.parametrize(
+    ("part", "known", "left_out"),
+    [("approximation", known_levels, "approximation_odd"), ("while_moving", known_motors, "moving_moments")],
+)
+def test_what_only_some_calibrations_measure_is_kept_and_a_part_of_it_is_refused(tmp_path, part, known, left_out):
     path = tmp_path / "p.npz"
-    make(approximation=known_levels()).save(path)
-    kept = Profile.load(path).approximation.arrays()
-    for name, array in known_levels().arrays().items():
+    make(**{part: known()}).save(path)
+    kept = getattr(Profile.load(path), part).arrays()
+    for name, array in known().arrays().items():
         assert kept[name].dtype == array.dtype and kept[name].tobytes() == array.tobytes(), name
-    rewrite(path, approximation_odd=None)
-    refused(path, "array fields missing: approximation_odd; give a profile")
+    rewrite(path, **{left_out: None})
+    refused(path, f"array fields missing: {left_out}; give a profile")
     make().save(path)
-    assert Profile.load(path).approximation is None
+    assert getattr(Profile.load(path), part) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "match"),
+    [
+        ("density", np.zeros(600, np.float32), r"moving_density is float32 of shape \(600,\)"),
+        ("density", np.full(GRID_BINS, np.nan, np.float32), "moving_density is nan at position 0"),
+        ("moments", np.array(-1.0), "moving_moments is -1 at position 0, expected 0 to"),
+        ("seconds", np.zeros(1), r"moving_seconds is float64 of shape \(1,\)"),
+    ],
+)
+def test_a_damaged_part_of_what_moves_is_one_line(tmp_path, name, array, match):
+    make(while_moving=known_motors()).save(tmp_path / "p.npz")
+    rewrite(tmp_path / "p.npz", **{f"moving_{name}": array})
+    refused(tmp_path / "p.npz", match)
+
+
+def test_what_a_frame_expects_of_motors_is_the_same_for_any_transform():
+    narrow, wide = (StftConfig(n_fft=n, hop=n // 2, window_length=n) for n in (512, 1024))
+    shares = np.exp(-np.square((narrow.frequencies - 1500.0) / 400.0)).astype(np.float32)
+    kept = WhileMoving.learned(shares, narrow, 0.0, 1.0)
+    np.testing.assert_allclose(kept.with_voice(narrow), shares, atol=0.01)
+    assert kept.with_voice(wide).sum() == pytest.approx(shares.sum(), rel=0.01)
+    assert kept.level_db == pytest.approx(10 * np.log10(shares.sum()), abs=0.1)
 
 
 @pytest.mark.parametrize(
