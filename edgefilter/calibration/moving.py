@@ -31,7 +31,7 @@ def calibrate_moving(
     recording : ndarray of float, shape (n,) or (n, channels)
         What its microphones hear while it talks for some seconds and moves as usual, and nobody else speaks; full scale +-1.
     reference : ndarray of float, shape (n,)
-        What it says meanwhile, as it is sent to the loudspeaker, on the same sample counter.
+        What it says meanwhile, as it is sent to the loudspeaker, on the same sample counter. Of the longer one the rest is not used.
     sample_rate : int
         Of both; they are converted to 16 kHz.
 
@@ -51,8 +51,10 @@ def calibrate_moving(
     The running filter listens and learns as it does in use (`filter.residual_echo`, `filter.barge_in`), but knows that nobody speaks.
     """
     stream = Stream(engines.create("crnn", profile), profile, barge_in=NOBODY)
+    heard, said = at_16_khz(recording, sample_rate), at_16_khz(reference, sample_rate)
+    both = min(len(heard), len(said))
     try:
-        stream.process(at_16_khz(recording, sample_rate), at_16_khz(reference, sample_rate))
+        stream.process(heard[:both], said[:both])
     except SignalError as error:
         raise CalibrationError(f"the recording of the moving robot: {error}") from None
     stage = stream.front.linear_stage
