@@ -201,5 +201,17 @@ def run(options: argparse.Namespace) -> str:
         humans = told(own)
         kinds[kind] |= {"humans": len(humans), "audible": sum(one.audible for one in humans)}
     notes = f"Of {ENGINE}'s network; a human in one hop of {1 / HUMAN_SHARE:.0f}."
-    return results.write(options.output, "probability", "Probability of speech", made_with, tables(kinds), notes=notes,
-                         kinds=kinds)  # fmt: skip
+    return results.write(options.output, "probability", "Probability of speech", made_with, tables(kinds), [diagram(kinds)],
+                         notes, kinds=kinds)  # fmt: skip
+
+
+def diagram(kinds: dict[str, dict]) -> dict:
+    """The reliability diagram: for each kind the share of hops with a human over the probability, and what is right."""
+    lines = {
+        name: tuple([row[key] for row in of["before"]["rows"]] for key in ("said", "share"))
+        for name, of in kinds.items()
+    }
+    lines["right"] = EDGES, EDGES
+    return results.plot(
+        "reliability", [results.panel("Reliability", "probability", "share of hops with a human", lines, "o-")]
+    )

@@ -29,8 +29,6 @@ from edgefilter.types import SAMPLE_RATE, Samples
 
 NOISE_S = 5
 """Of the noise alone: a power spectral density good to 1 dB in bands of 60 Hz."""
-VOICE_DB = 9.0
-"""Peak of speech over that of a sweep which is as loud: a peak of -3 dB for one of -12."""
 BUFFERS_S = (0.2, 0.4, 0.6)
 """Asked of the sound system, the later ones where the first lost sound. 0.2 s lost nothing beside a client of 20 ms on a
 PulseAudio null sink, where 0.05 s did four times of four; with two of 0.6 s the delay is still below the 1.6 s in which a
@@ -123,7 +121,8 @@ def _record(args: argparse.Namespace, folder: Path) -> tuple[Samples, Samples, S
 def _record_moving(args: argparse.Namespace, folder: Path) -> tuple[Samples, Samples]:
     """What the microphone hears while a voice is played and the robot moves, and that voice."""
     voice = read(str(DEMO / "reference.flac"), "voice")
-    voice *= min(1.0, 10 ** ((args.level_db + VOICE_DB) / 20)) / np.abs(voice).max()
+    peak = 10 ** (args.level_db / 20) / SWEEP_PART  # that of multisines, whose loud moments are those of such speech
+    voice *= min(1.0, peak) / np.abs(voice).max()
     recorded, said = (folder / f"{name}.wav" for name in MOVING)
     write_file(said, voice, float32=True)
     told = f"now talking: {round(voice.size / SAMPLE_RATE)} s of a voice; let the robot move as it does when it talks"

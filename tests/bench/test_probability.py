@@ -10,6 +10,7 @@ from bench.training.probability import (
     Listened,
     audible,
     curve,
+    diagram,
     fitted,
     platt,
     reliability,
@@ -75,6 +76,8 @@ def test_the_curve_counts_false_starts_an_hour_and_who_is_noticed(known):
         "before": reliability([human], 3, 1),
         "after": reliability([human], 1, 1),
     }
+    drawn = diagram({"real": found})["panels"][0]["lines"]
+    assert drawn["real"][1] == [row["share"] for row in found["before"]["rows"]] and len(drawn["right"][0]) == 9
     as_it_is = curve([alone, human, late], 3.25, 1.25)
     curves = {"curve_before": as_it_is, "curve": list(points.values())}
     fits, _, by_threshold = tables({"real": {**found, **curves, "humans": 2, "audible": 1}})
