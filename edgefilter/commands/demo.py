@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import soundfile
 
+from edgefilter.audio.fade import Fade
 from edgefilter.audio.files import FileSink, FileSource, write_file
 from edgefilter.commands.add import Fitted, fit
 from edgefilter.commands.display import describe_latency, print_result, progress, report_part, say
@@ -21,6 +22,7 @@ from edgefilter.diagnosis.result import in_order
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.engines import NEEDS_PROFILE
 from edgefilter.errors import UsageError
+from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.budget import DEMO
 from edgefilter.filter.ego_filter import EgoFilter, enhance
 from edgefilter.profile.data import Profile
@@ -28,6 +30,8 @@ from edgefilter.report.text import decibels, headline
 from edgefilter.session import filter_blocks
 from edgefilter.types import SAMPLE_RATE, Samples
 
+ASK_DB = 12.0
+"""By how much the robot lowers its voice to hear whether a human interrupts it: as people do."""
 HUMAN_DB, HUMAN_AT_S = -20.0, 1.0
 """Level of the human over the robot in the same seconds, and when the human begins to interrupt it."""
 
@@ -62,17 +66,19 @@ def _filter(args: argparse.Namespace) -> None:
             "si_sdr_after_db": _si_sdr(filtered, human),
             "si_sdr_after_uncalibrated_db": cold,
         }
+        step("again, with a robot that lowers its voice to listen, and stops")
+        sounds = {"microphone.wav": mic, "human.wav": human, "interrupted.wav": interrupted(mic, reference)}
         step("drawing")
-        write_file(folder / "microphone.wav", mic)
-        write_file(folder / "human.wav", human)
-        files = ["filtered.wav", "microphone.wav", "human.wav"]
+        for name, sound in sounds.items():
+            write_file(folder / name, sound)
+        files = ["filtered.wav", *sounds]
         if plots := _drawer("plots"):
-            sounds = {
+            drawn = {
                 "microphone: the robot talks, its fan runs, a human interrupts": mic,
                 "filtered: what edgefilter leaves of it": filtered,
                 "the human alone, for comparison": human,
             }
-            plots.plot_before_after(sounds, folder / "before_after.png")
+            plots.plot_before_after(drawn, folder / "before_after.png")
             files.append("before_after.png")
     begun, ended = (at / SAMPLE_RATE for at in (speaking(human).start, speaking(human).stop))
     without = "" if cold is None else f", {cold:.1f} dB without it"
@@ -82,10 +88,29 @@ def _filter(args: argparse.Namespace) -> None:
         f"SI-SDR of the human: {figures['si_sdr_before_db']:.1f} dB before, {figures['si_sdr_after_db']:.1f} dB after"
         f" with the robot's calibration{without}",
         f"listen to microphone.wav, in which the robot hides the human, who speaks from {begun:.0f} to {ended:.0f} s; then to"
-        " filtered.wav, from which the robot is gone; human.wav is the human alone",
+        " filtered.wav, from which the robot is gone; human.wav is the human alone, interrupted.wav what people hear of a robot"
+        " that lowers its voice when somebody may interrupt it, and stops when it is so",
         f"files: {', '.join(str(folder / file) for file in files)}",
     ]
     print_result(args, lines, figures)
+
+
+def interrupted(mic: Samples, reference: Samples) -> Samples:
+    """The bundled conversation at the microphone (n,), had the robot lowered its voice where the filter asks, and stopped for the human."""
+    known = EgoFilter(DEMO / "profile.npz", engine="linear", keep_channels=True)
+    known.process(mic, reference)
+    left, stats = known.robot_removed()[:, 0], known.stats()["alignment"]  # whole hops
+    lag = round(stats["delay_samples"] or 0) if stats else 0
+    ego = EgoFilter(DEMO / "profile.npz", engine="crnn", barge_in=BargeInSettings(ask_db=ASK_DB))
+    fade, gains, heard = Fade(), np.ones(left.size + lag, np.float32), mic[: left.size].copy()
+    for at in range(0, left.size, ego.hop):
+        now = slice(at, at + ego.hop)
+        fade.wanted = 0.0 if ego.human_speaks else ego.voice_gain
+        played = fade.apply(np.ones(ego.hop, np.float32), SAMPLE_RATE)
+        gains[at + lag : at + lag + ego.hop] = played
+        heard[now] += (gains[now] - 1.0) * (mic[: left.size] - left)[now]
+        ego.process(heard[now], played * reference[now])
+    return heard
 
 
 @dataclass(frozen=True, eq=False)

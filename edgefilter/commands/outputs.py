@@ -39,7 +39,7 @@ FOLDERS: dict[tuple[str, str], tuple[str, ...]] = {
     ("calibrate", "save_input"): tuple(f"{name}.wav" for name in (*RECORDINGS, *MOVING)),
     ("ros2", "output"): ("mic.wav", "reference.wav"),
     ("demo", "output"): (
-        *("filtered.wav", "microphone.wav", "human.wav", "before_after.png"),
+        *("filtered.wav", "microphone.wav", "human.wav", "interrupted.wav", "before_after.png"),
         *(f"{case}/{name}" for case in CASES for name in HIDDEN_FILES),
     ),
 }

@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 
+import numpy as np
 import pytest
 import soundfile
 
@@ -41,6 +42,16 @@ def test_it_filters_the_bundled_recording_and_the_human_stands_out(demo):
     assert (
         figures["si_sdr_after_db"] > 9.2
     )  # 9.3 is promised, int8 sums differ between processors; random weights give 3.7
+
+
+@pytest.mark.slow
+def test_a_listener_hears_the_robot_stop_for_the_human_and_not_before(demo):
+    microphone, human, heard = (
+        soundfile.read(demo[0] / f"{name}.wav")[0] for name in ("microphone", "human", "interrupted")
+    )
+    assert np.array_equal(heard[: 9 * 16_000], microphone[: 9 * 16_000])  # who speaks then is the robot alone
+    before, after = (10 * np.log10(np.mean((x - human)[11 * 16_000 :] ** 2)) for x in (microphone, heard))
+    assert after < before - 15  # the fan goes on
 
 
 @pytest.mark.slow
