@@ -49,6 +49,15 @@ def calibrate_moving(
     Notes
     -----
     The running filter listens and learns as it does in use (`filter.residual_echo`, `filter.barge_in`), but knows that nobody speaks.
+
+    Examples
+    --------
+    >>> import soundfile
+    >>> from edgefilter.filter.budget import DEMO
+    >>> heard, human, said = (soundfile.read(DEMO / f"{name}.flac")[0][:128_000] for name in ("mic", "human", "reference"))
+    >>> robot = calibrate_moving(Profile.load(DEMO / "profile.npz"), heard - human, said)
+    >>> 5.0 < robot.while_moving.seconds < 8.0
+    True
     """
     stream = Stream(engines.create("crnn", profile), profile, barge_in=NOBODY)
     heard, said = at_16_khz(recording, sample_rate), at_16_khz(reference, sample_rate)
