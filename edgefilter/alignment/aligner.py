@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edgefilter.alignment.belief import Belief, believed
+from edgefilter.alignment.belief import SAME, Belief, believed
 from edgefilter.alignment.coarse_lag import CoarseLag
 from edgefilter.alignment.delay_line import HALF_WIDTH, WAIT, DelayBuffer, kernel_table, read_delayed, read_line
 from edgefilter.alignment.delay_tracker import DRIFTED, FAINT, SIZE, STRIDE, DelayMeasurement, DelayMeter, DriftFilter
@@ -25,11 +25,11 @@ LIKELY_LAG_S = 2.0
 """Lag of the playback up to which an utterance is waited for: one that is heard later is rarer than a loudspeaker that is muted."""
 LATE = SAMPLE_RATE // 10
 """Samples by which a reference may come after its echo and is still found for an utterance; with LATEST they are found .15 s later."""
-LATEST = SAMPLE_RATE
-"""The same in a search of all lags that supposes no beginning of an utterance. Its window is twice as long, so that half of it is left at
-this lateness."""
-LOOKS, FIRST_LOOK = 12, SAMPLE_RATE // 2
-"""Looks that are remembered, and samples of an utterance after which there is one: then one every LATEST, and one at each realignment.
+LATEST, FURTHEST, STRETCH = 2 * SAMPLE_RATE, 5 * SAMPLE_RATE, 3 * SAMPLE_RATE
+"""The same in a look that supposes no beginning of an utterance, the most lag there, which is told but not followed, and samples of the
+microphone in it, so that a second is left at any."""
+LOOKS, FIRST_LOOK, NEXT_LOOK = 12, SAMPLE_RATE // 2, SAMPLE_RATE
+"""Looks that are remembered, samples of an utterance after which there is one, and from one to the next; one more at each realignment.
 Speech that begins while the reference is silent waits for as long until it is nobody's but a human's: the reference may follow."""
 SEARCH_STRIDE = 768
 """Samples between two searches of the whole range."""
@@ -115,7 +115,7 @@ class Aligner:
         """What an arrival looks like from now on: the microphones' impulse responses (taps,); None: anything."""
         self._responses = responses
         early = [one[: PRE_ROLL + REFLECTIONS] for one in responses or ()]
-        self._lags = LagSearch(self._max_lag, early, LATE, (LATEST, 2 * LATEST))
+        self._lags = LagSearch(self._max_lag, early, LATE, (FURTHEST, LATEST, STRETCH))
         self._meter = DelayMeter(None if responses is None else responses[self._used[0]])
 
     def reset(self) -> None:
@@ -201,17 +201,31 @@ class Aligner:
             if not aligned.realigned and now < self._next_look:
                 return None
             sure = CERTAIN / (CERTAIN + 1.0) if aligned.state == "coarse" else aligned.confidence
-            seen, self._next_look = Found.followed(round(aligned.delay), sure, now), now + LATEST
+            seen, self._next_look = Found.followed(round(aligned.delay), sure, now), now + NEXT_LOOK
         if seen is None:
             return None
+        self._looks.append(seen)
+        lags = np.array([look.lag for look in self._looks])
+        alike = np.count_nonzero(np.abs(lags - lags[:, None]) <= SAME, axis=0) > 1
         # where a robot says something again, so does chance: what is more likely wrong than right is not believed if it agrees
-        self._looks.append(seen if seen.clearness > EVEN else replace(seen, clearness=0.0))
-        self._belief = believed(self._looks)
+        doubted = [look if look.clearness > EVEN else replace(look, clearness=0.0) for look in self._looks]
+        # but speaks for the robot, of a path with several arrivals alike say, against its not being heard at all
+        there = [look if agrees else unsure for look, unsure, agrees in zip(self._looks, doubted, alike, strict=True)]
+        self._belief = replace(believed(doubted), evidence=believed(there).evidence)
         return self._belief
 
     def _follows(self, state: AlignmentState) -> bool:
-        """Whether the lag that is followed counts as the result of a search: not if the reference came after its echo when it was found."""
-        return state in ("locked", "coarse") and not (self._belief.late[-1:] > 0.5).any()
+        """Whether the lag that is followed counts as the result of a search: not if the robot was heard at one that is not when it was found."""
+        return state in ("locked", "coarse") and not self._displaced
+
+    @property
+    def _displaced(self) -> bool:
+        """Whether the robot is rather heard at a lag that is not followed."""
+        return bool((self._belief.late[-1:] + self._belief.beyond[-1:] > 0.5).any())
+
+    def _certain(self, found: Found) -> bool:
+        """Whether a search is to be believed, also against a lag that is certain but not followed."""
+        return found.odds > CERTAIN * (CERTAIN if self._displaced else 1.0)
 
     def _look_coarsely(self, mic: Samples, ref: Samples, by_bands: CoarseLag) -> bool:
         """Find where the reference is to be read as long as nothing sharper is known; True if that is elsewhere than before."""
@@ -294,11 +308,10 @@ class Aligner:
         switched = next(self._steps, None)
         if switched is None:
             now = self._ref.end
-            # it sounds, or did when a look was due while another was under way
-            sounds = now - self._onsets.current.end <= SEARCH_STRIDE
-            due = sounds and now >= self._next_look and not self._follows(self._state())
+            heard = now - self._onsets.current.end <= FURTHEST  # as long as it may be, however late
+            due = heard and now >= self._next_look and not self._follows(self._state())
             if due:
-                self._next_look += LATEST
+                self._next_look += NEXT_LOOK
             elif self._to_search > 0:
                 return False
             self._steps = self._look_anywhere() if due else self._look_for_utterance()
@@ -307,17 +320,20 @@ class Aligner:
 
     def _look_anywhere(self) -> Iterator[bool]:
         """Look at the latest sound and suppose nothing of it; a step at a time."""
+        sounds = self._ref.end - self._onsets.current.end <= SEARCH_STRIDE
         self._lags.prepare(self._ref, self._ref.end)
         yield False
         self._lags.listen({0: self._mics[self._used[0]]}, self._ref.end, self._looked)
         yield False
         # in a silent microphone the robot is not heard: a search without a result
-        self._seen = self._lags.find() or Found(0, 0.0, self._ref.end)
-        self._looked = self._ref.end + min(
-            self._seen.lag, 0
-        )  # so that the next search uses sound that this one has not used
-        sure = self._seen.lag >= -WAIT and self._seen.odds > CERTAIN
-        yield sure and bool(self._open) and not self._known and self._take(self._seen)
+        found = self._lags.find() or Found(0, 0.0, self._ref.end)
+        # where nothing sounds any more, others do: that it is not found says nothing then
+        if sounds or found.clearness > EVEN:
+            self._seen = found
+        # so that the next search uses sound that this one has not used
+        self._looked = self._ref.end + min(found.lag, 0)
+        sure = -WAIT <= found.lag <= self._max_lag and self._certain(found)
+        yield sure and bool(self._open) and not self._known and self._take(found)
 
     def _look_for_utterance(self) -> Iterator[bool]:
         """Look for the oldest unresolved utterance, or an announced one, a step at a time, each with whether the delay was switched.
@@ -345,7 +361,7 @@ class Aligner:
         found, looked_back = self._lags.find(), False
         while found is not None:
             # a reference that comes after its echo is rare: two windows must show it
-            if found.odds > CERTAIN and (looked_back or (found.lag >= -WAIT and not found.old)):
+            if self._certain(found) and (looked_back or (found.lag >= -WAIT and not found.old)):
                 yield self._take(found)
                 return
             yield False

@@ -18,7 +18,7 @@ from edgefilter.errors import SignalError
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 REACH = round(MOST_LAG_S * SAMPLE_RATE)
-"""Samples of lag, either way."""
+"""Samples of lag, either way; a running filter follows .1 s more."""
 LOOK = SAMPLE_RATE
 """Samples of the recording in one look: clocks 300 ppm apart move the lag by 5 of them meanwhile. Of 23 real recordings with an echo it
 is found in all; with looks of 2 s not in two whose lag changes faster, or whose microphone is processed."""
@@ -40,14 +40,16 @@ class Belief:
 
     starts: (looks,), first sample of each second. lags: (looks,), the likeliest, samples by which the recording lags behind
     the reference, below zero where that is late. probability: (looks,), of these lags against all others and none at all.
-    late: (looks,), probability that the reference comes after its echo, by more than the filter waits for it. evidence: natural
-    logarithm of the odds that the recording contains the reference at all.
+    late: (looks,), probability that the reference comes after its echo, by more than the filter waits for it. beyond: (looks,),
+    probability that the lag is more than is followed. evidence: natural logarithm of the odds that the recording contains the
+    reference at all.
     """
 
     starts: Array
     lags: Array
     probability: Array
     late: Array
+    beyond: Array
     evidence: float
 
     @property
@@ -97,7 +99,8 @@ class Belief:
         """What the seconds say that hear half a second or more of the reference from begin to end, or all of it."""
         said = self.starts - self.lags
         there = np.minimum(said + LOOK, end) - np.maximum(said, begin) >= min(LOOK // 2, end - begin)
-        return Belief(self.starts[there], self.lags[there], self.probability[there], self.late[there], self.evidence)
+        starts, lags, probability = self.starts[there], self.lags[there], self.probability[there]
+        return Belief(starts, lags, probability, self.late[there], self.beyond[there], self.evidence)
 
 
 def believe(recording: Samples, reference: Samples) -> Belief:
@@ -119,7 +122,8 @@ def believe(recording: Samples, reference: Samples) -> Belief:
 def believed(looks: Sequence[Found]) -> Belief:
     """What looks one after the other say of the lag, as `believe` has it; a running filter asks it of its latest ones."""
     if not looks:
-        return Belief(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0), 0.0)
+        none, never = np.zeros(0, int), np.zeros(0)
+        return Belief(none, none, never, never, never, 0.0)
     lags = np.array([look.lag for look in looks])
     order, state = np.argsort(lags, kind="stable"), np.zeros(lags.size, int)
     state[order[1:]] = np.cumsum(np.diff(lags[order]) > SAME)
@@ -128,13 +132,15 @@ def believed(looks: Sequence[Found]) -> Belief:
     seen[np.arange(lags.size), state] += cells * np.array([look.odds / look.prior for look in looks])
     anew, late = np.ones(seen.shape[1]), np.full(seen.shape[1], EARLY_ODDS / (1.0 + EARLY_ODDS))
     anew[state], late[state] = [look.prior / cells for look in looks], lags < -WAIT
+    beyond = np.zeros(seen.shape[1])
+    beyond[state] = lags > REACH + SAMPLE_RATE // 10
     before, evidence = _after(seen, anew)
     known = before * _after(seen[::-1], anew)[0][::-1] / (seen * anew)
     known = expit(evidence) * known / known.sum(axis=1, keepdims=True)
     likely, at = known[:, :-1].argmax(axis=1), np.arange(lags.size)
     nearest = np.where(state == likely[:, None], np.abs(at - at[:, None]), lags.size).argmin(axis=1)
     starts = np.array([look.at - LOOK for look in looks])
-    return Belief(starts, lags[nearest], known[at, likely], known @ late, evidence)
+    return Belief(starts, lags[nearest], known[at, likely], known @ late, known @ beyond, evidence)
 
 
 def _after(seen: Array, anew: Array) -> tuple[Array, float]:
@@ -184,7 +190,7 @@ def _reverberation_db(recording: Samples, reference: Samples, found: Belief) -> 
 
 def _looks(recording: Samples, reference: Samples) -> list[Found]:
     """What looks one after the other at the recording (n,) find in the reference (m,)."""
-    search = LagSearch(2 * REACH, any_lag=(0, LOOK))
+    search = LagSearch(0, any_lag=(2 * REACH, 0, LOOK))
     mic, ref = DelayBuffer(REACH + recording.size), DelayBuffer(reference.size)
     mic.push(np.zeros(REACH, np.float32))  # a lag of -REACH is none then
     mic.push(recording)

@@ -91,15 +91,19 @@ class LagSearch:
     that early reflections do not pull the peak, and the peaks of all microphones lie at one lag. Chance peaks grow with the
     root of the energy that a lag lets overlap, so the correlation is divided by that. `prepare`, `listen` and `find` are one
     search and cost one transform each, `listen` one a microphone, so that they can be spread over three hops; while the
-    reference to be looked at is short, so are the transforms. early: samples by which the reference may be late. any_lag: by
-    which it may be in a look that supposes nothing, and of the microphone in that look, WINDOW or more.
+    reference to be looked at is short, so are the transforms. max_lag, early: samples by which the microphone and the reference
+    may be late. any_lag: by which they may be in a look that supposes nothing, and of the microphone in that look, WINDOW or more.
     """
 
     def __init__(
-        self, max_lag: int, responses: Sequence[Samples] = (), early: int = 0, any_lag: tuple[int, int] = (0, WINDOW)
+        self,
+        max_lag: int,
+        responses: Sequence[Samples] = (),
+        early: int = 0,
+        any_lag: tuple[int, ...] = (0, 0, WINDOW),
     ) -> None:
-        self._max_lag, self._for_utterance, self._for_any = max_lag, (early, WINDOW), any_lag
-        self.span, self._whole = _fast(max_lag + sum(any_lag)), _fast(max_lag + early + WINDOW)
+        self._for_utterance, self._for_any = (max_lag, early, WINDOW), any_lag
+        self.span, self._whole = _fast(sum(any_lag)), _fast(sum(self._for_utterance))
         self._short, self._signed = _fast(self._whole // 2), False
         sizes = (self._whole, self._short, WINDOW + 2 * ASIDE)
         self._phases = {size: [_phase(one, size) for one in responses] for size in sizes}
@@ -107,12 +111,12 @@ class LagSearch:
     def prepare(self, ref: DelayBuffer | Playback, now: int, since: int | None = None) -> None:
         """Read the reference from sample counter `since`, or all of it and suppose nothing, up to `now`; transform it for `listen`."""
         if since is None:
-            since, size, (self._early, self._window) = now - self.span, self.span, self._for_any
+            since, size, (most, self._early, self._window) = now - self.span, self.span, self._for_any
         else:
-            self._early, self._window = self._for_utterance
+            most, self._early, self._window = self._for_utterance
             size = self._short if now - since <= self._short - self._early - WINDOW else self._whole
         self._size, self._signed = size, bool(self._phases.get(size))
-        self._lags = self._early + min(self._max_lag, size - self._early - self._window)
+        self._lags = self._early + min(most, size - self._early - self._window)
         first = max(since - (now - size), self._early)
         r = np.zeros(size, np.float32)
         r[first:] = ref.read(now - size + first, now)

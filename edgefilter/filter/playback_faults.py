@@ -54,11 +54,9 @@ def speeds(mic: Samples, ref: Samples) -> Iterator[tuple[float, float] | None]:
     for step, score in zip(range(-STEPS, STEPS + 1), scores, strict=True):
         # the microphone's spectra as they would be at a speed of 1: stretched in time, and moved by so many bins
         at = np.arange(round(heard.shape[0] * np.exp(STEP * step))) * np.exp(-STEP * step)
-        whole = np.minimum(at.astype(int), heard.shape[0] - 2)
-        part = (at - whole).astype(np.float32)[:, None]
         slower = np.zeros((size, heard.shape[1]), np.float32)
         first, last = max(step, 0), heard.shape[1] + min(step, 0)
-        moved = (1.0 - part) * heard[whole, first:last] + part * heard[whole + 1, first:last]
+        moved = _between(heard[:, first:last], at)
         slower[: at.size, first - step : last - step] = moved
         cross = (fourier.rfft(np.ascontiguousarray(slower.T)) * spectra).sum(axis=0)
         # logarithms of spectra: where any sound overlaps, its energy is thousands
@@ -86,15 +84,19 @@ def _best(scores: Array) -> tuple[float, float]:
 def _harmonics(x: Samples) -> Samples:
     """Logarithm of each frame's spectrum, less its envelope over frequency and less each bin's mean over time, (frames, bins)."""
     power = fourier.power(fourier.rfft(frames(x, FRAME, HOP) * hann(FRAME).astype(np.float32)))
-    at = BINS_HZ * FRAME / SAMPLE_RATE
-    whole = at.astype(int)
-    part = (at - whole).astype(np.float32)
-    read = (1.0 - part) * power[:, whole] + part * power[:, whole + 1]
+    read = _between(power.T, BINS_HZ * FRAME / SAMPLE_RATE).T
     found = np.log(read + np.float32(FLOOR) * read.max() + fourier.TINY)
     found -= uniform_filter1d(found, FORMANTS, axis=1)
     found -= found.mean(axis=0)
     loudness = power.sum(axis=1)
     return found * (loudness > 1e-3 * loudness.max())[:, None]
+
+
+def _between(rows: Array, at: Array) -> Array:
+    """Rows (n, m) at fractional positions (k,), interpolated linearly, (k, m)."""
+    whole = np.minimum(at.astype(int), rows.shape[0] - 2)
+    part = (at - whole).astype(np.float32)[:, None]
+    return (1.0 - part) * rows[whole] + part * rows[whole + 1]
 
 
 def other_rates(speed: float) -> str:

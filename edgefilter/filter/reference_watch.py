@@ -10,9 +10,9 @@ from typing import Literal
 
 import numpy as np
 
-from edgefilter.alignment.aligner import FIRST_LOOK, LATEST, LOOKS, Aligned, Past
+from edgefilter.alignment.aligner import FIRST_LOOK, LOOKS, NEXT_LOOK, Aligned, Past
 from edgefilter.alignment.belief import Belief
-from edgefilter.alignment.lag_search import CERTAIN
+from edgefilter.alignment.lag_search import CERTAIN, MOST_LAG_S
 from edgefilter.alignment.utterances import FLOOR, VARIES, Sustained
 from edgefilter.dsp import fourier
 from edgefilter.dsp.lag import one_signal
@@ -53,7 +53,7 @@ class ReferenceWatch:
         self._hop = hop
         self.verdict: Verdict = "unknown"
         self.without = self.same = False
-        self._late = 0
+        self._late = self._behind = 0
         self._missing, self._grew, self._another = "", False, False
         self._off_speed = False
         # of each look: logarithm of the speed found, and its clearness
@@ -65,7 +65,7 @@ class ReferenceWatch:
         self._rise = 10 ** (hop / (10 * SAMPLE_RATE))
         self._levels: deque[float] = deque(maxlen=LOOKS)
         self._sound = RobotSound(hop, bins)
-        self._played, self._played_at = 0.0, -LATEST
+        self._played, self._played_at = 0.0, -NEXT_LOOK
         self._products, self._sounding = np.zeros(3), 0
         self._said: set[str] = set()
         self._ever = False
@@ -78,8 +78,8 @@ class ReferenceWatch:
 
     @property
     def _displaced(self) -> bool:
-        """Whether a fault of the reference is known: it is late, lacks samples or has another speed."""
-        return self.verdict == "late" or bool(self._missing) or self._off_speed
+        """Whether a fault of the reference is known: it is late, far ahead, lacks samples or has another speed."""
+        return self.verdict == "late" or bool(self._behind or self._missing) or self._off_speed
 
     @property
     def wait(self) -> int:
@@ -104,7 +104,7 @@ class ReferenceWatch:
             self._least = min(power, self._rise * self._least)
         checks: tuple[tuple[EventKind, str], ...] = (
             ("reference_late", self._late_by(aligned.belief, aligned.past)),
-            ("robot_unfound", self._unheard(aligned)),
+            ("robot_unfound", self._far_behind() or self._unheard(aligned)),
             ("echo_unpredicted", self._unpredicted(removal)),
             ("same_signal", self._same(pre_emphasised(mic), pre_emphasised(ref))),
             ("reference_gaps", self._lacks_samples()),
@@ -199,7 +199,7 @@ class ReferenceWatch:
             if brought > LOUD * aligned.past.onsets.peak:
                 self._played += 0.01 * (brought - self._played) if self._played else brought
                 self._sound.learn(fourier.power(frame.mic))
-        lag = LATEST if math.isnan(aligned.delay) else int(aligned.delay)
+        lag = NEXT_LOOK if math.isnan(aligned.delay) else int(aligned.delay)
         if now - self._played_at < lag + SAMPLE_RATE // 4:
             return ""
         robot = self._sound.compare(fourier.power(frame.mic), frame.noise_psd)
@@ -225,6 +225,7 @@ class ReferenceWatch:
         sounding = 2 * sum(level > VARIES for level in self._levels) - len(self._levels)
         unlike = np.logaddexp(belief.evidence, sounding * math.log(OTHERS / (1.0 - OTHERS)))
         self._another, self._loudest = bool(unlike < -math.log(CERTAIN)), 0.0
+        self._behind = int(belief.lags[-1]) * bool(belief.beyond[-1] > CERTAIN / (CERTAIN + 1.0))
         if late > CERTAIN / (CERTAIN + 1.0):
             self.verdict = "late"
         elif late < 1.0 / (CERTAIN + 1.0):
@@ -236,6 +237,16 @@ class ReferenceWatch:
             f"the reference comes {1000 * self._late / SAMPLE_RATE:.0f} ms after the microphone has heard it: the robot is"
             " not removed, and nobody is noticed while it talks; hand the reference over earlier, or the microphone later;"
             " or are the two swapped?"
+        )
+
+    def _far_behind(self) -> str:
+        """Say that the robot is heard later than its lag is followed."""
+        if not self._behind or not self._once("unfound"):
+            return ""
+        return (
+            f"the microphone hears the reference {self._behind / SAMPLE_RATE:.1f} s after it comes, and a lag of {MOST_LAG_S:g} s is the most"
+            " that is followed: the robot is not removed, and nobody is noticed while it talks; hand the reference over later, or"
+            " shorten what the player has waiting"
         )
 
     def _unheard(self, aligned: Aligned) -> str:

@@ -242,6 +242,20 @@ def test_a_robot_in_loud_rumble_is_found_where_no_window_alone_is_certain_but_se
     assert abs(hops[found[0]].delay - truth[256 * found[0]]) < 24
 
 
+@pytest.mark.parametrize(
+    ("lags", "heard"), [((16_892, 16_893, 22_380, 16_898, 22_371), True), ((5273, 2751, 9468, 6451, 27_536), False)]
+)
+def test_weak_looks_that_agree_are_no_sign_that_the_robot_is_not_heard(lags, heard):
+    """Of a path with several arrivals alike no look is clear, and a robot that talked in turn with a human was said not to be found."""
+    aligner = Aligner(256)
+    begun = aligner.step(np.zeros(256, np.float32), np.zeros(256, np.float32))._replace(state="begun")
+    for second, lag in enumerate(lags, 1):
+        aligner._seen = Found(lag, 1.2, RATE * second)
+        belief = aligner._believe(begun)
+    assert (belief.evidence > 0.0) == heard
+    assert belief.probability[-1] < 0.5  # a robot that says something again agrees with itself, too
+
+
 def test_a_look_back_raises_the_odds_of_a_lag_that_it_shows_and_lowers_those_of_another():
     rng = np.random.default_rng(3)
     said = speech_like(rng, 2.0)

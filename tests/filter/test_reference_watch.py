@@ -336,11 +336,24 @@ def test_a_lag_of_nearly_three_seconds_is_found(robot):
     assert ego.stats()["alignment"]["delay_samples"] == pytest.approx(2.8 * RATE, abs=40)
 
 
+@pytest.mark.parametrize(
+    ("seconds", "kind"), [(-1.6, "reference_late"), (3.3, "robot_unfound"), (4.0, "robot_unfound")]
+)
+def test_a_lag_that_is_not_followed_is_told_with_its_length_soon_after_the_robot_is_heard(robot, seconds, kind):
+    """It was told after up to 16 s, or never; and the robot's own voice was locked to at a wrong lag later on."""
+    moved = round(seconds * RATE) - LAG
+    mic, ref = (np.pad(x, (3 * RATE + by, 6 * RATE - by)) for x, by in zip(robot, (moved, 0), strict=True))
+    told = [event for event in events(EgoFilter(engine="linear"), mic, ref) if event.kind in SET_UP_WRONG]
+    assert [event.kind for event in told] == [kind]
+    assert f"{abs(seconds):.1f} s" in told[0].detail or f"{-1000 * seconds:.0f} ms" in told[0].detail
+    assert told[0].sample < (3 + max(seconds, 0.0) + 3) * RATE
+
+
 def test_an_utterance_that_is_found_in_the_end_is_not_said_to_be_unfound_hop_after_hop():
     watch, hop, onsets = ReferenceWatch(1600, 1601), np.ones(1600, np.float32), OnsetDetector(1600)
     for level in (1e-3, 0.1, 0.1, 0.1, 0.1):
         onsets.step(level * hop)
-    nothing = Belief(np.zeros(1, int), np.zeros(1, int), np.zeros(1), np.zeros(1), -20.0)
+    nothing = Belief(np.zeros(1, int), np.zeros(1, int), *np.zeros((3, 1)), -20.0)
     begun = Aligned(hop, 0.0, 0.0, 0.0, "begun", False, past=Past(DelayBuffer(1600), DelayBuffer(1600), onsets))
     said = [watch.step(1e-3 * hop, 0.1 * hop, begun, SILENT_FRAME, Removal(1600), False)]
     for aligned in [*[begun._replace(belief=nothing)] * 8, *[begun._replace(state="locked")] * 8]:
