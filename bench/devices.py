@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from bench import provenance, recordings, results, runner, systems
+from bench.detectors import DETECTORS
 from bench.evaluate import names, numbers, of, slim
 from bench.metrics import IN_TIME_S, delays_s, difference, later, mean, per_hour
 from bench.recordings import Cells, Clip, Recording
@@ -30,6 +31,8 @@ DEFAULT = ("unfiltered", *(f"{engine}-uncalibrated{way}" for way in ("", "-learn
            *systems.PEERS, "clean")  # fmt: skip
 TUNED_ON = "F_i0k*,1N-e5*,yw9vi*,0B-YT*,0sjDo*,gf_0sK*,gf_6558*,realaec*,nanless*,smird*,wade*"
 """The devices whose recordings were there to look at and to tune on."""
+GLANCE = ("unfiltered+silero", "speexdsp-suppressed+silero", "aec3+silero", "crnn-uncalibrated+silero", "crnn-uncalibrated")
+"""Rows of the table that README.md quotes."""
 SOON_S = 0.5
 """A human who interrupts is to be noticed by then."""
 AHEAD_DB = 1.0
@@ -65,7 +68,7 @@ def run(options: argparse.Namespace) -> str:
     tuned_on = {clip.room for clip in clips if any(fnmatch(clip.room, one) for one in options.tuned_on)}
     kept, tuned = ([row for row in rows if (row["room"] in tuned_on) == told] for told in (False, True))
     parts = (("headline", "Devices kept apart", kept), ("tuned-on", "Devices tuned on", tuned))
-    tables = [overview(*part, here) for part in parts]
+    tables = [at_a_glance(kept, able), *(overview(*part, here) for part in parts)]
     tables += [who_interrupts(name, title, own, able) for name, title, own in parts]
     laid, alone = ([row for row in rows if row["set"] == part] for part in ("laid", "alone"))
     tables += [by_device("si_sdr", "SI-SDR of the human laid on, dB", laid, here, 1, tuned_on),
@@ -125,6 +128,21 @@ def overview(name: str, title: str, rows: Sequence[dict], here: Sequence[System]
                       mean(per_device(laid, "capped"), "capped"), mean(lowered, "erle_db"),
                       min((row["erle_db"] for row in lowered), default=None), starts(alone), soon(laid), *less])  # fmt: skip
     return results.table(name, f"{title}: {devices}, a human laid on {with_human}", columns, cells if devices else [])
+
+
+def at_a_glance(rows: Sequence[dict], able: Sequence[System]) -> dict:
+    """The rows of GLANCE: what is left of the robot, what of the human, and how often the robot would stop because of itself."""
+    known, cells = {one.name: one for one in able}, []
+    for name in (name for name in GLANCE if name in known):
+        row, _, detector = name.partition("+")
+        laid, alone = (of(rows, row, part) for part in ("laid", "alone"))
+        told, heard = (of(rows, name, part) for part in ("alone", "laid"))
+        cells.append([systems.catalogue()[row].title, mean(per_device(alone, "erle_db"), "erle_db"),
+                      mean(per_device(laid, "si_sdr"), "si_sdr"), mean(per_device(laid, "capped"), "capped"),
+                      DETECTORS[detector].title if detector else "edgefilter", starts(told), soon(heard)])  # fmt: skip
+    columns = ["the microphone through", ("robot alone, lowered by dB", 0), ("human, SI-SDR in dB", 1), ("words wrong, %", 0),
+               "who says that a human speaks", "false starts", f"humans noticed in {SOON_S} s"]  # fmt: skip
+    return results.table("glance", "At a glance: devices kept apart", columns, cells)
 
 
 def who_interrupts(name: str, title: str, rows: Sequence[dict], able: Sequence[System]) -> dict:

@@ -26,7 +26,7 @@ from edgefilter.errors import UsageError
 
 HEADLINE = ("unfiltered", "speexdsp-suppressed", "linear-uncalibrated", "linear-uncalibrated-learning",
             "crnn-uncalibrated-learning", "crnn", "crnn-learning")  # fmt: skip
-"""Rows of the table that README.md quotes."""
+"""Rows of the table that docs/index.md quotes."""
 PAIRED = "crnn-uncalibrated-learning"
 """The row with which the others of that table are compared, on the same clips: it needs nothing and is in all of them."""
 CUT = ("unfiltered", "paper-ss", "linear", "ss", "crnn", "crnn-learning", "crnn-uncalibrated", "speexdsp-suppressed",

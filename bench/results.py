@@ -29,7 +29,7 @@ SCHEMA = 3
 PACKAGES = ("numpy", "scipy", "onnxruntime", "faster-whisper", "ctranslate2", "jiwer", "pywebrtc-audio", "soundfile")
 ROOT = Path(__file__).parents[1]
 RESULTS = Path(__file__).parent / "results"
-PAGES = (ROOT / "README.md", ROOT / "bench" / "README.md")
+PAGES = (ROOT / "README.md", ROOT / "docs" / "index.md", ROOT / "bench" / "README.md")
 """Pages that quote tables: <!-- table: FILE/TABLE --> ... <!-- end -->."""
 QUOTED = re.compile(r"(<!-- table: (\w+)/([\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 CHUNK = 1 << 20

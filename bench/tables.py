@@ -1,4 +1,4 @@
-"""Write the tables of README.md and bench/README.md anew from bench/results.
+"""Write the tables of README.md, docs/index.md and bench/README.md anew from bench/results.
 
 A page quotes a table between two comments, ``<!-- table: devices/headline -->`` and ``<!-- end -->``: of the file
 devices.json the table named headline.

@@ -65,3 +65,15 @@ def test_what_interrupts_is_counted_for_each_row_that_tells_who_speaks():
     name, count, rate, *rest = cells
     assert (name, count, rate["mean"]) == ("X", 3, 6.0) and rate["low"] < 6.0 < rate["high"]
     assert rest == [1, 2, 400.0, 1, 1]
+
+
+def test_at_a_glance_each_detector_stands_beside_what_is_left_of_robot_and_human_in_its_row():
+    of = {"set": "laid", "room": "d", "clip": "b", "speaker": "s", "place": "p"}
+    rows = [{**of, "system": "unfiltered", "si_sdr": -12.0, "capped": 90.0}]
+    rows += [{**of, "set": "alone", "clip": "a", "system": "unfiltered", "erle_db": 0.5}]
+    rows += [{**of, "set": "alone", "clip": "a", "system": "unfiltered+silero", "false_starts": 7, "duration": 60.0}]
+    rows += [{**of, "system": "unfiltered+silero", "early": False, "delay_s": delay} for delay in (0.1, 0.7)]
+    able = systems.chosen(["unfiltered", "unfiltered+silero"])
+    (cells,) = devices.at_a_glance(rows, able)["rows"]
+    assert [cells[0], *(cell["mean"] for cell in cells[1:4])] == ["Unfiltered", 0.5, -12.0, 90.0]
+    assert cells[4:] == ["Silero VAD", "7 in 1.0 min", "1 of 2"]
