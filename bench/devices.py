@@ -31,7 +31,13 @@ DEFAULT = ("unfiltered", *(f"{engine}-uncalibrated{way}" for way in ("", "-learn
            *systems.PEERS, "clean")  # fmt: skip
 TUNED_ON = "F_i0k*,1N-e5*,yw9vi*,0B-YT*,0sjDo*,gf_0sK*,gf_6558*,realaec*,nanless*,smird*,wade*"
 """The devices whose recordings were there to look at and to tune on."""
-GLANCE = ("unfiltered+silero", "speexdsp-suppressed+silero", "aec3+silero", "crnn-uncalibrated+silero", "crnn-uncalibrated")
+GLANCE = (
+    "unfiltered+silero",
+    "speexdsp-suppressed+silero",
+    "aec3+silero",
+    "crnn-uncalibrated+silero",
+    "crnn-uncalibrated",
+)
 """Rows of the table that README.md quotes."""
 SOON_S = 0.5
 """A human who interrupts is to be noticed by then."""

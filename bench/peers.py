@@ -1,4 +1,4 @@
-"""Two public echo cancellers: SpeexDSP (the system's library, through ctypes) and WebRTC AEC3 (pywebrtc-audio)."""
+"""Public echo cancellers: SpeexDSP (the system's library, through ctypes), WebRTC AEC3 (pywebrtc-audio), echoff and voiceclean."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from functools import partial
 
 import numpy as np
+from scipy.signal import resample_poly
 
 from edgefilter.errors import UsageError
 from edgefilter.types import SAMPLE_RATE, Samples, as_samples
@@ -22,6 +23,9 @@ SUPPRESSED_DELAY = FRAME
 AEC3_FRAME = 160
 AEC3_DELAY = 128
 """Samples by which AEC3 delays the signal (it regroups frames of 80 samples into blocks of 64); removed here."""
+ECHOFF_TIMES, ECHOFF_DELAY = 3, 143
+"""By which its rate is ours, and samples at our rate by which it delays the signal; removed here."""
+VOICECLEAN_FRAME = 320
 
 
 def speexdsp(mic: Samples, ref: Samples, suppress: bool = False) -> Samples:
@@ -33,7 +37,7 @@ def speexdsp(mic: Samples, ref: Samples, suppress: bool = False) -> Samples:
     mic, ref = as_samples(mic, "mic"), as_samples(ref, "ref")
     delay = SUPPRESSED_DELAY if suppress else 0
     padding = (0, -(-(mic.size + delay) // FRAME) * FRAME - mic.size)
-    near, far = (np.rint(np.clip(np.pad(x, padding) * 32768.0, -32768, 32767)).astype(np.int16) for x in (mic, ref))
+    near, far = (_int16(np.pad(x, padding)) for x in (mic, ref))
     out = np.zeros_like(near)
     with speexdsp_frames(suppress) as step:
         for at in range(0, near.size, FRAME):
@@ -58,6 +62,38 @@ def aec3_frames() -> Callable[[Samples, Samples], object]:
     except ImportError as error:
         raise UsageError("AEC3 needs the package pywebrtc-audio: pip install pywebrtc-audio") from error
     return EchoCanceller(sample_rate=SAMPLE_RATE).process
+
+
+def echoff(mic: Samples, ref: Samples) -> Samples:
+    """echoff 0.3, LiveKit's WebRTC processing at 48 kHz with echoff's settings, (n,) float32 for mic and ref (n,), aligned."""
+    try:
+        from echoff import WebRtcAecProcessor
+    except ImportError as error:
+        raise UsageError("echoff is missing: pip install echoff (Python 3.11 or newer)") from error
+    mic, ref = as_samples(mic, "mic"), as_samples(ref, "ref")
+    padding = (0, -(-(mic.size + ECHOFF_DELAY) // AEC3_FRAME) * AEC3_FRAME - mic.size)
+    far, near = (resample_poly(np.pad(x, padding), ECHOFF_TIMES, 1).tolist() for x in (ref, mic))
+    out = resample_poly(np.array(WebRtcAecProcessor().process_pair(far, near)), 1, ECHOFF_TIMES)
+    return out[ECHOFF_DELAY : ECHOFF_DELAY + mic.size].astype(np.float32)
+
+
+def voiceclean(mic: Samples, ref: Samples) -> Samples:
+    """voiceclean 0.3's echo canceller, (n,) float32 for mic and ref (n,): chunks of 20 ms that correlate with what was played are masked."""
+    try:
+        from voiceclean.aec import AEC
+    except ImportError as error:
+        raise UsageError("voiceclean is missing: pip install voiceclean") from error
+    mic, ref = as_samples(mic, "mic"), as_samples(ref, "ref")
+    padding, canceller, out = (0, -mic.size % VOICECLEAN_FRAME), AEC(sample_rate=SAMPLE_RATE), b""
+    frames = (_int16(np.pad(x, padding)).reshape(-1, VOICECLEAN_FRAME) for x in (mic, ref))
+    for near, far in zip(*frames, strict=True):
+        canceller.feed_reference(far.tobytes())
+        out += canceller.process(near.tobytes())
+    return np.frombuffer(out, np.int16)[: mic.size].astype(np.float32) / 32768.0
+
+
+def _int16(x: Samples) -> np.ndarray:
+    return np.rint(np.clip(x * 32768.0, -32768, 32767)).astype(np.int16)
 
 
 @contextmanager

@@ -39,7 +39,8 @@ LISTEN = "-listen"
 ARRAYS = (2, 3, 4)
 """Numbers of microphones, of conversations that have so many."""
 TRUE_LAG = "-true-lag"
-PEERS = {"speexdsp": "SpeexDSP", "speexdsp-suppressed": "SpeexDSP with its suppressor", "aec3": "WebRTC AEC3"}
+PEERS = {"speexdsp": "SpeexDSP", "speexdsp-suppressed": "SpeexDSP with its suppressor", "aec3": "WebRTC AEC3",
+         "echoff": "echoff", "voiceclean": "voiceclean"}  # fmt: skip
 HEARD = ("unfiltered", "speexdsp-suppressed", "aec3", "crnn-uncalibrated")
 """Rows behind which a detector of speech can stand, as "ROW+DETECTOR" or "ROW+DETECTOR-held"."""
 ABSENT = {
@@ -351,7 +352,8 @@ def _files(module: object, model: Path | None = None) -> str:
 
 
 def _peers() -> list[System]:
-    late = (peers.FRAME, peers.FRAME + peers.SUPPRESSED_DELAY, peers.AEC3_FRAME + peers.AEC3_DELAY)
+    late = (peers.FRAME, peers.FRAME + peers.SUPPRESSED_DELAY, peers.AEC3_FRAME + peers.AEC3_DELAY,
+            peers.AEC3_FRAME + peers.ECHOFF_DELAY, peers.VOICECLEAN_FRAME)  # fmt: skip
     found = []
     for (name, title), samples in zip(PEERS.items(), late, strict=True):
         process = getattr(peers, name.replace("-", "_"))

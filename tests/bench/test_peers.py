@@ -22,7 +22,8 @@ def echo_scene() -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize(
-    ("peer", "least_db"), [(peers.speexdsp, 10.0), (peers.speexdsp_suppressed, 20.0), (peers.aec3, 20.0)]
+    ("peer", "least_db"),
+    [(peers.speexdsp, 10.0), (peers.speexdsp_suppressed, 20.0), (peers.aec3, 20.0), (peers.echoff, 20.0)],
 )
 def test_peer_cancels_an_echo_without_human(peer, least_db: float) -> None:
     mic, ref = echo_scene()
@@ -33,7 +34,7 @@ def test_peer_cancels_an_echo_without_human(peer, least_db: float) -> None:
     assert erle(mic[last], peer(mic, np.zeros_like(ref))[last]) < 3.0  # it is the reference that does it
 
 
-@pytest.mark.parametrize("peer", [peers.speexdsp, peers.aec3])
+@pytest.mark.parametrize("peer", [peers.speexdsp, peers.aec3, peers.echoff, peers.voiceclean])
 def test_peer_output_is_aligned_with_the_input(peer) -> None:
     human = babble(6.0, 9)[: 6 * RATE - 77]
     out = peer(human, np.zeros_like(human))
