@@ -65,7 +65,7 @@ def aec3_frames() -> Callable[[Samples, Samples], object]:
 
 
 def echoff(mic: Samples, ref: Samples) -> Samples:
-    """echoff 0.3, LiveKit's WebRTC processing at 48 kHz with echoff's settings, (n,) float32 for mic and ref (n,), aligned."""
+    """Echoff 0.3, LiveKit's WebRTC processing at 48 kHz with echoff's settings, (n,) float32 for mic and ref (n,), aligned."""
     try:
         from echoff import WebRtcAecProcessor
     except ImportError as error:
@@ -78,7 +78,7 @@ def echoff(mic: Samples, ref: Samples) -> Samples:
 
 
 def voiceclean(mic: Samples, ref: Samples) -> Samples:
-    """voiceclean 0.3's echo canceller, (n,) float32 for mic and ref (n,): chunks of 20 ms that correlate with what was played are masked."""
+    """Voiceclean 0.3's echo canceller, (n,) float32 for mic and ref (n,): chunks of 20 ms that correlate with what was played are masked."""
     try:
         from voiceclean.aec import AEC
     except ImportError as error:
