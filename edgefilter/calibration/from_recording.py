@@ -11,6 +11,7 @@ from scipy.ndimage import binary_closing, uniform_filter1d
 
 from edgefilter.alignment.belief import believe, find_lag
 from edgefilter.calibration.sweep import DRIFT_REACH
+from edgefilter.dsp.convolution import filtered
 from edgefilter.dsp.fractional_delay import delayed, interpolate
 from edgefilter.dsp.frames import SILENT, all_block_power, block_power, decibels, frames
 from edgefilter.dsp.lag import correlation_near, flat_cross
@@ -20,7 +21,7 @@ from edgefilter.echo.effects.catalogue import EFFECTS
 from edgefilter.echo.measurement import whiten
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.recording import BLOCK, fitted_blocks, paired
-from edgefilter.echo.wiener import convolve_from, fit_filter
+from edgefilter.echo.wiener import fit_filter
 from edgefilter.errors import SignalError
 from edgefilter.profile.approximation import CLEARLY_DB
 from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, GRID_HZ, PROVISIONAL, Profile
@@ -110,10 +111,10 @@ def self_calibrate(recording: Samples, reference: Samples, *, sample_rate: int =
     sound = whiten(_drifting(delayed(x, lag - FIT.reach), ppm), psd)
     rough = fit_filter(sound, target, fit * disturbance(target), 2 * FIT.reach, 0, np.full(2 * FIT.reach, 1e-2))
     delay = lag - FIT.reach + int(np.argmax(np.abs(rough)))
-    weights = fit * disturbance(target - convolve_from(sound, rough, 0))
+    weights = fit * disturbance(target - filtered(sound, rough, 0))
     sound = whiten(_drifting(delayed(x, delay - PRE_ROLL), ppm), psd)
     path = fit_path(sound, target, weights, float(np.square(rough).max()))
-    predicted = convolve_from(sound, path, 0)
+    predicted = filtered(sound, path, 0)
     _check_learned(target, predicted, fit, delay, ppm, believed.missing)
     bands, snr = bands_over_fan(predicted)
     echo = EchoModel(path.astype(np.float32))
@@ -209,11 +210,11 @@ def fit_path(sound: Samples, target: Samples, weights: Samples, peak: float) -> 
 
     def left(prior: Array) -> float:
         taps = fit_filter(sound, target, weights * ~rest, FIT.taps, 0, prior)
-        return float(np.sum(weights * rest * (target - convolve_from(sound, taps, 0)) ** 2))
+        return float(np.sum(weights * rest * (target - filtered(sound, taps, 0)) ** 2))
 
     best = min((decay_prior(seconds, peak) for seconds in FIT.decays_s), key=left)
     taps = fit_filter(sound, target, weights, FIT.taps, 0, best, steps=12)
-    weights = np.where(weights > 0.0, disturbance(target - convolve_from(sound, taps, 0)), 0.0).astype(np.float32)
+    weights = np.where(weights > 0.0, disturbance(target - filtered(sound, taps, 0)), 0.0).astype(np.float32)
     return fit_filter(sound, target, weights, FIT.taps, 0, best, steps=20)
 
 

@@ -13,6 +13,7 @@ from scipy import fft
 from scipy.ndimage import uniform_filter1d
 
 from edgefilter.dsp import fourier
+from edgefilter.dsp.convolution import filtered
 from edgefilter.dsp.frames import decibels, frames
 from edgefilter.dsp.psd import GRID_BINS, ROUNDING_PSD, coloured, floored, frequencies, hann, variance_at
 from edgefilter.dsp.stft import StftConfig
@@ -20,7 +21,6 @@ from edgefilter.echo.least_squares import normal_equations
 from edgefilter.echo.measurement import Measurement, level_ratio
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.recording import BLOCK
-from edgefilter.echo.wiener import convolve_from
 from edgefilter.types import Array, Samples
 
 FRAME, HOP = StftConfig.n_fft, StftConfig.hop
@@ -216,7 +216,7 @@ class Straightened:
         weights, _ = normal_equations([white], target, TOLERANCE_TAPS, lead, rows).solve(1e-5)
         response = np.fft.rfft(weights[0], 256)
         bounded = np.fft.irfft(response * np.minimum(1.0, TOLERANCE / np.maximum(np.abs(response), 1e-12)), 256)
-        return prediction + convolve_from(prediction, np.roll(bounded, 96), 96 + lead)
+        return prediction + filtered(prediction, np.roll(bounded, 96), 96 + lead)
 
     @cached_property
     def _fan(self) -> Samples:

@@ -6,10 +6,12 @@ import numpy as np
 from scipy import fft
 
 from edgefilter.dsp.frames import frames
-from edgefilter.types import Array
+from edgefilter.types import Array, Samples
 
 TOGETHER = 8
 """Blocks or frames that are transformed at once, so that memory stays bounded."""
+FEW = 4
+"""Taps up to which a filter is faster by sums than by transforms."""
 
 
 def convolve(x: Array, taps: Array) -> Array:
@@ -30,3 +32,13 @@ def convolve(x: Array, taps: Array) -> Array:
     for at in range(0, count, TOGETHER):
         out[at : at + TOGETHER] = fft.irfft(fft.rfft(read[at : at + TOGETHER]) * response, size)[:, before:]
     return out.ravel()[:whole]
+
+
+def filtered(x: Samples, taps: Array, lead: int = 0) -> Samples:
+    """The signal x (n,) through taps (t,), tap k a delay of k - lead samples, (n,) float32."""
+    taps = taps.astype(np.float32)
+    if not x.size or not taps.any():
+        return np.zeros(x.size, np.float32)
+    whole = np.convolve(x, taps) if taps.size <= FEW else convolve(x, taps)
+    whole = np.pad(whole, (0, max(lead + x.size - whole.size, 0)))
+    return whole[lead : lead + x.size].astype(np.float32, copy=False)

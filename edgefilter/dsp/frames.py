@@ -11,6 +11,9 @@ SILENT = 10**-4.5
 """Power, 45 dB under the loudest of a voice, under which it is silent."""
 
 
+DB_PER_NEPER = 20.0 / np.log(10.0)
+
+
 def stretch(x: NDArray, start: int, stop: int) -> NDArray:
     """Samples start..stop-1 of x (n,), a new array (stop - start,), zeros where x has none."""
     out = np.zeros(stop - start, x.dtype)
@@ -55,4 +58,9 @@ def all_block_power(x: Samples, size: int) -> Array:
 
 def decibels(power: Array | np.floating | float, least: float = 1e-12) -> Array:
     """10 lg of a power, at least that of `least`."""
-    return 10.0 * np.log10(np.maximum(power, least))
+    return DB_PER_NEPER / 2.0 * np.log(np.maximum(power, least))
+
+
+def amplitude(gain_db: Array) -> Array:
+    """The factor that a gain in dB is; faster than a power of ten."""
+    return np.exp(gain_db / DB_PER_NEPER)

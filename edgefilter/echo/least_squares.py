@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from edgefilter.dsp.convolution import convolve
+from edgefilter.dsp.convolution import filtered
 from edgefilter.types import Array, Samples
 
 NUISANCE_TAPS, NUISANCE_LEAD = 16, 8
@@ -81,17 +81,6 @@ def hats(x: Array, knots: Array, beyond: bool = False) -> Array:
     at = np.arange(x.size)
     parts[left, at], parts[left + 1, at] = 1.0 - share, share
     return parts
-
-
-def filtered(x: Samples, taps: Array, lead: int = 0) -> Samples:
-    """The signal x (n,) through taps (t,), tap k a delay of k - lead samples, (n,) float32."""
-    taps = taps.astype(np.float32)
-    if not x.size or not taps.any():
-        return np.zeros(x.size, np.float32)
-    padded = np.pad(x, (0, lead)) if lead else x
-    many = padded.size > CHUNK and taps.size > 4  # then transforms are faster than sums
-    whole = convolve(padded, taps) if many else np.convolve(padded, taps)
-    return whole[lead : lead + x.size].astype(np.float32, copy=False)
 
 
 def absorbed(predicted: Samples, target: Samples, fit: np.ndarray | None = None) -> Samples:

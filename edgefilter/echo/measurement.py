@@ -11,7 +11,7 @@ from typing import Any, Protocol, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from edgefilter.dsp.convolution import convolve
+from edgefilter.dsp.convolution import convolve, filtered
 from edgefilter.dsp.psd import floored
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
@@ -40,6 +40,10 @@ class VoiceModel(Protocol):
     @property
     def timed(self) -> bool:
         """Whether what the model predicts depends on when the recording began."""
+
+    @property
+    def as_filter(self) -> tuple[Samples, int] | None:
+        """The filter (taps,) that the model is and its lead; None where it is more than that."""
 
     def predict(self, reference: Samples) -> Samples:
         """The robot's voice at the microphone (n,) for an aligned reference (n,)."""
@@ -79,7 +83,12 @@ class Measurement:
 
     def whiten(self, x: Samples) -> Samples:
         """The signal x (n,) through a zero-phase filter after which the fan is white with variance 1; x itself where the fan is unknown."""
-        return x if self._whitening is None else _centred(x, self._whitening)
+        return x if self._whitening is None else filtered(x, self._whitening, self._whitening.size // 2)
+
+    def heard(self, model: VoiceModel, x: Samples) -> Samples:
+        """What a model makes of another reference x (m,), whitened, (m,): by one filter where it is one."""
+        whole = self.once(_whitened, model)
+        return self.whiten(model.predict(x)) if whole is None else filtered(x, *whole)
 
     @cached_property
     def fingerprint(self) -> float:
@@ -122,7 +131,8 @@ class Measurement:
 
 def whiten(x: Samples, noise_psd: Samples) -> Samples:
     """Filter x (n,) by 1 / sqrt(noise_psd), floored, zero-phase, so that noise of that one-sided PSD gets variance 1."""
-    return _centred(x, whitening_taps(noise_psd))
+    taps = whitening_taps(noise_psd)
+    return filtered(x, taps, taps.size // 2)
 
 
 def whitening_taps(noise_psd: Samples) -> Samples:
@@ -132,9 +142,12 @@ def whitening_taps(noise_psd: Samples) -> Samples:
     return taps.astype(np.float32)
 
 
-def _centred(x: Samples, taps: Samples) -> Samples:
-    """Put x (n,) through a filter whose middle tap is its moment 0."""
-    return convolve(x, taps)[taps.size // 2 :][: x.size].astype(np.float32, copy=False)
+def _whitened(measurement: Measurement, model: VoiceModel) -> tuple[Samples, int] | None:
+    """The filter of a model and the whitening behind it as one, and its lead; None where the model is no filter."""
+    found, white = model.as_filter, measurement._whitening
+    if found is None or white is None:
+        return found
+    return convolve(found[0], white), found[1] + white.size // 2
 
 
 def level_ratio(recording: Samples, predicted: Samples) -> float:

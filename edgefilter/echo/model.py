@@ -10,11 +10,12 @@ from typing import TypeAlias
 
 import numpy as np
 
+from edgefilter.dsp.convolution import filtered
 from edgefilter.echo.effect import RECORDING, Effect, complete, vanishes
 from edgefilter.echo.effects.catalogue import chain, find
 from edgefilter.echo.measurement import Measurement, Values
 from edgefilter.echo.running import is_filter
-from edgefilter.echo.wiener import LONGEST, convolve_from
+from edgefilter.echo.wiener import LONGEST
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 LEAD = 1024
@@ -40,10 +41,16 @@ class EchoModel:
         x, n = _through(ahead, reference), reference.size
         played = np.zeros(n, np.float32)
         for path, changing in paths:
-            heard = convolve_from(x, path, lead)
+            heard = filtered(x, path, lead)
             share = None if changing is None else changing[0].share(changing[1], n, SAMPLE_RATE)
             played += heard if share is None else share * heard
         return _through(behind, played)
+
+    @property
+    def as_filter(self) -> tuple[Samples, int] | None:
+        """The filter (taps,) that predict() is and its lead in samples; None where an effect is more than that."""
+        ahead, ((path, _), *later), lead, behind = self._chain
+        return None if ahead or later or behind else (path, lead)
 
     @cached_property
     def _chain(self) -> tuple[Chain, list[tuple[Samples, tuple[Effect, Values] | None]], int, Chain]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from edgefilter.dsp.convolution import convolve
+from edgefilter.dsp.convolution import filtered
 from edgefilter.dsp.fourier import power as power_of
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.recording import BLOCK
@@ -20,12 +20,6 @@ DELAYS = np.arange(-80.0, 81.0) / 10.0
 """Samples by which the lag of a filtered recording may be off: it is found as that of the loudest frequencies."""
 LONGEST = 12800
 """Taps of the longest filter that is fitted, 0.8 s: the decay by 60 dB of an office, by 40 dB of a hall."""
-
-
-def convolve_from(x: Samples, taps: Array, lead: int) -> Samples:
-    """Return sum_k taps[k] x(n - k + lead), (n,) float32."""
-    y = convolve(x, taps.astype(np.float32))
-    return np.pad(y, (0, max(lead + x.size - y.size, 0)))[lead : lead + x.size].astype(np.float32, copy=False)
 
 
 def fit_filter(
@@ -73,7 +67,7 @@ def fit_filter(
 def fit_supported(x: Samples, target: Samples, weights: Samples, lead: int, prior: Array) -> Array:
     """fit_filter's answer; zeros where a filter from half of the samples does not help on the other half (BLOCKs, two by two)."""
     half, taps = np.arange(x.size) // BLOCK % 4 < 2, prior.size
-    trial = convolve_from(x, fit_filter(x, target, weights * half, taps, lead, prior, steps=20), lead)
+    trial = filtered(x, fit_filter(x, target, weights * half, taps, lead, prior, steps=20), lead)
     fall = float(np.dot(target * target - (target - trial) ** 2, weights * ~half))
     return fit_filter(x, target, weights, taps, lead, prior, steps=40) if fall > 0.0 else np.zeros(taps)
 

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import uniform_filter1d
 
+from edgefilter.dsp.convolution import filtered
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.frames import decibels
 from edgefilter.echo.effect import Effect, Parameter, complete, first, neutral, numbers
 from edgefilter.echo.effects.knock_power import BAND_HZ, BANDS, band_power, frames_to_fit
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel, level_ratio
-from edgefilter.echo.wiener import DELAYS, Spectra, convolve_from, fit_filter, spectra
+from edgefilter.echo.wiener import DELAYS, Spectra, fit_filter, spectra
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 Filter: TypeAlias = tuple[float, float, float]
@@ -80,9 +81,9 @@ class Bandlimit(Effect):
         hz = np.arange(FFT // 2 + 1) * sample_rate / FFT
         response = low_pass(hz, float(values["cutoff_hz"]), float(values["order"]), float(values["phase"]))
         response = response * np.exp(-2j * np.pi * hz / sample_rate * float(values["delay"]))
-        y = convolve_from(x, fft.fftshift(fft.irfft(response, FFT)), FFT // 2)
+        y = filtered(x, fft.fftshift(fft.irfft(response, FFT)), FFT // 2)
         taps = numbers(values, "taps")
-        return y + convolve_from(x, taps, LEAD) if taps.any() else y
+        return y + filtered(x, taps, LEAD) if taps.any() else y
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """The best of a grid of cut-offs, orders and phases, refined, each at its best delay and gain, in the whitened cross-spectrum. Then taps.
@@ -118,7 +119,7 @@ class Bandlimit(Effect):
         values: Values = {"cutoff_hz": best[0], "order": best[1], "phase": best[2], "delay": late}
         heard, plain = measurement.white_recording, self.apply(x, {**values, "taps": 0.0}, SAMPLE_RATE)
         taps = fit_filter(x, heard - plain, measurement.weights, TAPS, LEAD, prior=np.full(TAPS, 1e-3), steps=15)
-        passed = plain + convolve_from(x, taps, LEAD)
+        passed = plain + filtered(x, taps, LEAD)
         values = {**values, "taps": np.clip(taps, -10.0, 10.0)}
         noisy = bool(model.unpredictable(measurement.reference))  # then what is heard there may be that
         if not noisy and not _dull_above(best[0], measurement, x, passed):

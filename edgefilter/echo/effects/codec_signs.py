@@ -7,11 +7,12 @@ import scipy
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter, uniform_filter1d
 
+from edgefilter.dsp.convolution import filtered
 from edgefilter.dsp.fourier import power as power_of
 from edgefilter.dsp.frames import decibels, frames
 from edgefilter.dsp.psd import hann
 from edgefilter.echo.measurement import Measurement
-from edgefilter.echo.wiener import convolve_from, fit_filter
+from edgefilter.echo.wiener import fit_filter
 from edgefilter.types import Samples
 
 TAPS, LEAD = 256, 64
@@ -45,7 +46,7 @@ def is_codec(measurement: Measurement, voice: Samples) -> bool:
     """
     left = measurement.white_recording - voice
     taps = fit_filter(voice, left, measurement.weights, TAPS, LEAD, prior=np.full(TAPS, 1e-3), steps=15)
-    fine = convolve_from(voice, taps, LEAD)
+    fine = filtered(voice, taps, LEAD)
     voice, left = voice + fine, left - fine
     heard = (measurement.weights > 0.0) & (uniform_filter1d(voice * voice, LONG[0]) > HEARD)
     cells = _spectra(voice, *SHORT), _spectra(left, *SHORT), _whole(heard, *SHORT)

@@ -7,6 +7,7 @@ from itertools import product
 import numpy as np
 import scipy
 
+from edgefilter.dsp.frames import amplitude, decibels
 from edgefilter.echo.effect import Effect, Parameter, Runner, first, within
 from edgefilter.echo.effects.gain_fit import Reach, fit_one
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
@@ -85,11 +86,11 @@ class Compressor:
             return x * np.float32(10.0 ** (self._makeup / 20.0))
         square = np.square(x, dtype=np.float64)
         power, self._level = scipy.signal.lfilter([1.0 - self._keep], [1.0, -self._keep], square, zi=self._level)
-        over, knee = 10.0 * np.log10(power + 1e-12) - self._threshold, self._knee
+        over, knee = decibels(power.astype(np.float32)) - self._threshold, self._knee
         bent = np.clip(over + knee / 2, 0.0, knee) ** 2 / (2 * knee) if knee > 0.0 else 0.0
         held = falling_peak(bent + np.maximum(over - knee / 2, 0.0), self._release, self._held)
         self._held = float(held[-1]) if held.size else self._held
-        return (x * 10.0 ** ((self._makeup - self._slope * held) / 20.0)).astype(np.float32)
+        return (x * amplitude(self._makeup - self._slope * held)).astype(np.float32)
 
 
 def falling_peak(x: Array, samples: float, before: float) -> Array:

@@ -9,10 +9,11 @@ import scipy
 from numpy.typing import NDArray
 from scipy import fft
 
+from edgefilter.dsp.convolution import filtered
 from edgefilter.dsp.fourier import log_response
 from edgefilter.echo.effect import Effect, Parameter, neutral, numbers
 from edgefilter.echo.measurement import ORDINARY_DB, Measurement, Values, VoiceModel
-from edgefilter.echo.wiener import DELAYS, Spectra, convolve_from, fit_filter, spectra
+from edgefilter.echo.wiener import DELAYS, Spectra, fit_filter, spectra
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 LOWEST_HZ, HIGHEST_HZ, KNOTS = 80.0, 7600.0, 40
@@ -56,9 +57,9 @@ class Equaliser(Effect):
             hz = np.arange(FFT // 2 + 1) * sample_rate / FFT
             nepers = _basis(FFT // 2 + 1, sample_rate, gain_db.size) @ (gain_db * (np.log(10.0) / 20.0))
             response = np.exp(nepers - 2j * np.pi * hz / sample_rate * delay)
-            y = convolve_from(x, fft.fftshift(fft.irfft(response, FFT)), FFT // 2)
+            y = filtered(x, fft.fftshift(fft.irfft(response, FFT)), FFT // 2)
         taps = numbers(values, "taps")
-        return y + convolve_from(x, taps, LEAD) if taps.any() else y
+        return y + filtered(x, taps, LEAD) if taps.any() else y
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Levenberg-Marquardt in the gains of all knots and the delay, in the whitened cross-spectrum; then taps. Neutral for a turned volume."""

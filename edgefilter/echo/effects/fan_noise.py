@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from edgefilter.dsp.convolution import filtered
 from edgefilter.dsp.frames import decibels, frames
 from edgefilter.dsp.psd import GRID_BINS, floored, periodograms
 from edgefilter.dsp.tones import tones
 from edgefilter.echo.effect import NEVER_S, RECORDING, Effect, Parameter, first, neutral, within
-from edgefilter.echo.least_squares import absorbed, filtered
+from edgefilter.echo.least_squares import absorbed
 from edgefilter.echo.measurement import SILENT, STEADY_DB, Measurement, Values, VoiceModel
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 

@@ -10,9 +10,11 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 from scipy.ndimage import map_coordinates
 
+from edgefilter.dsp.convolution import filtered
 from edgefilter.dsp.frames import block_power, block_sums, blocks, decibels
 from edgefilter.echo.effect import Effect, Parameter, Runner, Stage, first, neutral, numbers, vanishes, within
-from edgefilter.echo.least_squares import filtered, hats, normal_equations
+from edgefilter.echo.effects.gain_fit import EXCERPT
+from edgefilter.echo.least_squares import hats, normal_equations
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import fit_filter
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
@@ -96,7 +98,7 @@ class _Ground:
 
     def part(self, x: Samples) -> Samples:
         """What a part (n,) of x becomes at the microphone, whitened."""
-        return self._measurement.whiten(self._model.predict(x) if self._ahead else x)
+        return self._measurement.heard(self._model, x) if self._ahead else self._measurement.whiten(x)
 
     def solve(self, parts: Sequence[Samples], bends: Array) -> Array:
         """Least-squares weights of x's parts (k, n), their bends (m, k) held small; (k,)."""
@@ -110,6 +112,13 @@ class _Ground:
             for other in (self.heard, self.target)
         )
         return energy, cross
+
+    @staticmethod
+    def loudest(energy: Array) -> slice:
+        """The stretch of EXCERPT with most of the energy (k,) of its steps."""
+        total, size = np.cumsum(np.pad(energy, (1, 0))), min(EXCERPT // STEP, energy.size)
+        start = int(np.argmax(total[size:] - total[: total.size - size]))
+        return slice(start, start + size)
 
 
 class FreeCurve(FreeLaw):
@@ -204,6 +213,8 @@ class FreeGain(FreeLaw):
         loud_db = float(np.ceil(decibels(np.max(block_power(ground.x, SAMPLE_RATE // 50)))))
         bends = np.concatenate((np.diff(np.eye(KNOTS), 2, axis=0), 0.1 * np.diff(np.eye(KNOTS), axis=0)))
         energy, cross = ground.sums(STEP)
+        part = ground.loudest(energy)
+        energy, cross, x = energy[part], cross[part], ground.x[part.start * STEP : part.stop * STEP]
 
         def knots(times: Times) -> Array:
             return _level_knots(loud_db + OVER_DB[times.peak])
@@ -213,7 +224,7 @@ class FreeGain(FreeLaw):
                 parts = hats(level, knots(times))
                 return _solved((parts * energy) @ parts.T, parts @ cross, bends)[1]
 
-            levels = _levels(ground.x, settings)
+            levels = _levels(x, settings)
             return settings[int(np.argmax([worth(*pair) for pair in zip(levels, settings, strict=True)]))]
 
         def refined(of: Times) -> Times:

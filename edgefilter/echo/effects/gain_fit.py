@@ -85,7 +85,7 @@ class GainFit:
     def gains(self, unknowns: Array) -> Array:
         """Least-squares gain of each part over the whole recording, (parts,)."""
         measurement = self._measurement
-        parts = [measurement.whiten(self._model.predict(part)) for part in self._make(measurement.reference, unknowns)]
+        parts = [measurement.heard(self._model, part) for part in self._make(measurement.reference, unknowns)]
         rows = np.stack(parts, axis=1) * measurement.weights[:, None]
         normal, right = (rows.T @ rows).astype(float), (rows.T @ measurement.white_recording).astype(float)
         return np.linalg.solve(normal + RIDGE * np.trace(normal) * np.eye(right.size) + 1e-30, right)
@@ -111,7 +111,7 @@ class GainFit:
         return self._target - rows @ self._weights(rows, self._target)
 
     def _heard(self, sound: Samples) -> Samples:
-        return self._measurement.whiten(self._model.predict(sound))
+        return self._measurement.heard(self._model, sound)
 
     def _rows(self, sounds: Sequence[Samples]) -> Samples:
         """Each sound as it is heard, at its lags, (chosen, sounds * TAPS)."""

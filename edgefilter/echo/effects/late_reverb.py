@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from edgefilter.dsp.convolution import filtered
 from edgefilter.dsp.frames import blocks
 from edgefilter.echo.effect import Effect, Parameter, first, neutral, numbers, within
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
-from edgefilter.echo.wiener import LONGEST, convolve_from, fit_filter, fit_supported
+from edgefilter.echo.wiener import LONGEST, fit_filter, fit_supported
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 LEAD = 32
@@ -77,7 +78,7 @@ class LateReverb(Effect):
 def with_added(response: Samples, values: Values, lead: int = LEAD) -> Samples:
     """The response (k,) with what is added to it, or what a filter behind it adds, its taps from lag -lead on, (k,)."""
     added, taps = numbers(values, "added")[: response.size], numbers(values, "taps")
-    changed = response + convolve_from(response, taps, lead) if taps.any() else response.copy()
+    changed = response + filtered(response, taps, lead) if taps.any() else response.copy()
     changed[: added.size] += added.astype(np.float32)
     return changed
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edgefilter.dsp.frames import block_sums
+from edgefilter.dsp.frames import amplitude, block_sums
 from edgefilter.echo.effect import Effect, Parameter, Runner, neutral, numbers, within
 from edgefilter.echo.least_squares import absorbed, hats
 from edgefilter.echo.measurement import ORDINARY_DB, Measurement, Values, VoiceModel, level_ratio
@@ -58,7 +58,7 @@ class MicAgc(Effect):
         if not knots.any():
             return x.copy()
         position = np.arange(x.size) * (float(values["knots_hz"]) / sample_rate)
-        return (x * 10.0 ** (np.interp(position, np.arange(knots.size), knots) / 20.0)).astype(np.float32)
+        return (x * amplitude(np.interp(position, np.arange(knots.size), knots))).astype(np.float32)
 
     def run(self, values: Values, sample_rate: int) -> Runner | None:
         """A follower of the gain, as far and as fast as it moved in the recording; none where it stood still."""

@@ -96,7 +96,7 @@ class PacketLoss(Effect):
 
             def error(value: float | Array) -> float:
                 played = self.apply(measurement.reference, {**found, "times_s": times, name: value}, SAMPLE_RATE)
-                left = measurement.white_recording - measurement.whiten(model.predict(played))
+                left = measurement.white_recording - measurement.heard(model, played)
                 return float(np.sum(left**2, dtype=np.float64))
 
             return min(tried, key=error)

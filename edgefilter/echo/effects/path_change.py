@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from edgefilter.dsp.convolution import filtered
 from edgefilter.dsp.frames import block_power
 from edgefilter.echo.effect import NEVER_S, Effect, Parameter, first, neutral, within
 from edgefilter.echo.effects.late_reverb import ADDED, beside, with_added
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
-from edgefilter.echo.wiener import convolve_from, fit_supported
+from edgefilter.echo.wiener import fit_supported
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 
 TAPS, EXPECTED = 3072, 1e-2
@@ -62,7 +63,7 @@ class PathChange(Effect):
             taps = fit_supported(x, residual, after, 0, np.full(TAPS, EXPECTED))
             if not taps.any():
                 return neutral(self)
-            change = convolve_from(x, taps, 0)
+            change = filtered(x, taps, 0)
             explained = np.cumsum(measurement.weights * change * (2.0 * residual - change), dtype=np.float64)
             start = edge + int(np.argmin(explained[edge : max(x.size - edge, edge + 1)]))
             time = start / SAMPLE_RATE

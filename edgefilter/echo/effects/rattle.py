@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from edgefilter.dsp.convolution import convolve
+from edgefilter.dsp.convolution import convolve, filtered
 from edgefilter.dsp.frames import frames
 from edgefilter.echo.effect import NEVER_REACHED, Effect, Parameter, complete, first, neutral, numbers, within
 from edgefilter.echo.effects.knock_power import (
@@ -33,7 +33,7 @@ from edgefilter.echo.effects.knock_power import (
     resonated,
     ringing_of,
 )
-from edgefilter.echo.least_squares import absorbed, filtered
+from edgefilter.echo.least_squares import absorbed
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
@@ -111,7 +111,7 @@ class Rattle(Effect):
             return [train * allowed if at.side * way >= 0.0 else np.zeros_like(train) for train, way in both]
 
         def explain(at: Trigger) -> tuple[float, Array]:
-            return _explained([measurement.whiten(model.predict(k)) for k in knocks_of(at)], rest, TAPS)
+            return _explained([measurement.heard(model, k) for k in knocks_of(at)], rest, TAPS)
 
         at, (gain, sounds) = trigger, explain(trigger)
         for again in range(REFINED):
@@ -139,7 +139,7 @@ class Rattle(Effect):
         """Fit power, decay_ms and rate_hz to what the predictable knocks leave."""
         x = measurement.reference
         knocks = one_side(_trains(x, values, SAMPLE_RATE), float(values["side"]))
-        predicted = measurement.whiten(model.predict(self.apply(x, complete(self, values), SAMPLE_RATE)))
+        predicted = measurement.heard(model, self.apply(x, complete(self, values), SAMPLE_RATE))
         target = measurement.white_recording
         over = band_power(target - absorbed(predicted, target, measurement.fit))
         use, fits = frames_to_fit(measurement.fit, len(over)), {}
@@ -179,7 +179,7 @@ def _matched(sound: Array, rest: Samples, measurement: Measurement, model: Voice
     length, at = 4096, 1024
     knock = np.zeros(length, np.float32)
     knock[at : at + sound.size] = sound
-    heard = measurement.whiten(model.predict(knock))
+    heard = measurement.heard(model, knock)
     return convolve(rest, heard[::-1])[length - 1 - at :][: rest.size].astype(np.float32)
 
 
@@ -218,7 +218,7 @@ def _predicts(
     halves: list[tuple[Samples, Samples]], residual: Samples, measurement: Measurement, model: VoiceModel
 ) -> bool:
     """Whether the sounds learnt from one half of the knocks explain some of the other half, both ways round."""
-    heard = [[measurement.whiten(model.predict(knocks)) for knocks in half] for half in zip(*halves, strict=True)]
+    heard = [[measurement.heard(model, knocks) for knocks in half] for half in zip(*halves, strict=True)]
     normals = [_normal(half, residual, TAPS) for half in heard]
     total = 0.0
     for (matrix, right), (other, wanted) in (normals, normals[::-1]):

@@ -86,7 +86,7 @@ class SpeakerNonlinearity(Effect):
             measurement.white_recording,
             measurement.weights,
             linear,
-            lambda sound: measurement.whiten(model.predict(sound)),
+            lambda sound: measurement.heard(model, sound),
             excerpt=excerpt(measurement, model, EXCERPT) if x.size >= 1.5 * EXCERPT else None,
         )
         if found is None:

@@ -7,11 +7,12 @@ import pytest
 from scipy import signal
 
 from edgefilter.diagnosis.prepare import prepare
+from edgefilter.dsp.convolution import filtered
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.effects.late_reverb import EXPECTED
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
-from edgefilter.echo.wiener import convolve_from, fit_filter
+from edgefilter.echo.wiener import fit_filter
 from edgefilter.types import PRE_ROLL
 from tests.diagnosis.robot_scene import DELAY, FAN, path, profile, record, voice
 
@@ -68,7 +69,7 @@ def test_what_is_known_of_a_decaying_room_helps_where_little_was_heard() -> None
     before = office.white_recording - office.predicted(model)[1]
     taps = values["added"].size
     flat = fit_filter(x, before, office.weights, taps, 0, prior=np.full(taps, EXPECTED), steps=40)
-    with_flat = before - convolve_from(x, flat, 0)
+    with_flat = before - filtered(x, flat, 0)
     assert left < 10 * np.log10(np.mean(with_flat[~office.fit].astype(float) ** 2)) - 0.5
 
 
