@@ -1,6 +1,7 @@
 """What importing costs. Who may import whom stands in pyproject.toml, and lint-imports checks it."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -47,3 +48,12 @@ def test_nothing_inside_goes_by_way_of_the_public_names():
     lines = [line for path in PACKAGE.rglob("*.py") for line in path.read_text().splitlines()]
     taken = {line.split()[-1] for line in lines if line.startswith(("from edgefilter import", "import edgefilter"))}
     assert taken == {"__version__", "engines"}
+
+
+def test_no_test_imports_what_another_file_of_tests_holds():
+    files = (Path(__file__).parent).rglob("*.py")
+    taken = {
+        path.name: re.findall(r"^\s*(?:from|import) tests\.(?:\w+\.)*test_\w+", path.read_text(), re.M)
+        for path in files
+    }
+    assert not {name: lines for name, lines in taken.items() if lines}

@@ -11,7 +11,7 @@ import soundfile
 
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE
-from tests.filter.test_arrays import calibration, talk
+from tests.filter.array_scene import calibration, talk
 from tests.program import edgefilter, one_line
 
 
@@ -81,7 +81,7 @@ def test_what_cannot_be_is_one_line_and_the_output_is_left_alone(folder: Path) -
 @pytest.mark.slow
 def test_calibrate_takes_the_microphones_that_are_named(folder: Path) -> None:
     from edgefilter import generate_sweep
-    from tests.filter.test_arrays import PATHS, fan
+    from tests.filter.array_scene import PATHS, fan
 
     sweep = generate_sweep()
     heard = np.stack([np.convolve(sweep, path)[: sweep.size] for path in PATHS[:3]], 1) + 1e-3 * fan(sweep.size, 3, 3)

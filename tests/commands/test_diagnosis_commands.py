@@ -10,10 +10,9 @@ import soundfile
 
 from edgefilter.cli import main
 from edgefilter.profile.data import Profile
+from tests.commands.diagnosis_scene import RATE, arguments, fails_in_one_line
 from tests.diagnosis.robot_scene import profile, record, voice
-from tests.echo.test_user_effects import documented_file
-
-RATE = 16000
+from tests.echo.own_effect import documented_file
 
 
 @pytest.fixture(scope="module")
@@ -30,11 +29,6 @@ def scene(tmp_path_factory):
         folder / "mic.wav", record(x, robot.echo.with_effect("playback_gain", {"gain_db": -3.0})), RATE, "FLOAT"
     )
     return folder
-
-
-def arguments(scene, command, *more, mic="mic.wav", ref="ref.wav", profile="robot.npz"):
-    words = ["--profile", scene / profile, "--recording", scene / mic, "--reference", scene / ref]
-    return [str(word) for word in (*command.split(), *words, *more)]
 
 
 def printed_json(capsys):
@@ -216,16 +210,6 @@ def bad(scene):
         robot, echo=replace(robot.echo, effects=(("blade_chop", {"rate_hz": 23.0, "cosine": 0.1, "sine": 0.0}),))
     ).save(scene / "own.npz")
     return scene
-
-
-def fails_in_one_line(capsys, words, code, expected):
-    capsys.readouterr()
-    assert main([str(word) for word in words]) == code
-    lines = capsys.readouterr().err.strip().splitlines()
-    told = [line for line in lines if line.startswith("edgefilter: ")]
-    assert len(told) == 1 and "Traceback" not in "".join(lines)
-    for part in expected:
-        assert part in told[0], told[0]
 
 
 @pytest.mark.parametrize("command", ["compare", "diagnose", "add playback_gain --output x.npz"])

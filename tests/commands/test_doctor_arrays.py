@@ -71,7 +71,7 @@ def test_a_clipped_microphone_is_named(sound: np.ndarray) -> None:
 
 
 def test_chirps_show_which_microphone_is_played_processed_exchanged_or_of_another_gain() -> None:
-    from tests.filter.test_arrays import PATHS, calibration, fan
+    from tests.filter.array_scene import PATHS, calibration, fan
 
     ref = np.pad(chirps(), (4000, 12000)).astype(np.float32)
     mics = np.stack([np.convolve(ref, path)[: ref.size] for path in PATHS[:3]]) + 1e-4 * fan(ref.size, 3, 3).T

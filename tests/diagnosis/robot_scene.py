@@ -10,6 +10,7 @@ from edgefilter.echo.model import EchoModel
 from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL
 
+RESONANCE = {"frequency_hz": 640.0, "q": 35.0, "gain_db": -2.0}
 FAN = 1e-3
 DELAY = 400.0
 
@@ -45,6 +46,14 @@ def profile(h: np.ndarray | None = None) -> Profile:
         np.array([40.0]),
         np.full(4, -60.0),
     )
+
+
+def office() -> EchoModel:
+    """The robot in a room of 0.5 s, its reverberation 12 dB below the direct sound."""
+    rng, taps = np.random.default_rng(5), np.zeros(8000)
+    late = np.arange(8000 - 200)
+    taps[200:] = rng.standard_normal(late.size) * 10 ** (-3 * late / 8000)
+    return EchoModel(path()).with_effect("late_reverb", {"taps": taps * 0.25 / np.linalg.norm(taps)})
 
 
 def voice(seconds: float = 8.0, seed: int = 0) -> np.ndarray:

@@ -16,18 +16,9 @@ from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.measurement import Values
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import SignalError, UsageError
-from tests.diagnosis.robot_scene import FAN, path, profile, record, voice
+from tests.diagnosis.robot_scene import FAN, RESONANCE, office, path, profile, record, voice
 
 DRIFT = {"ppm": 40.0, "offset": 0.0}
-RESONANCE = {"frequency_hz": 640.0, "q": 35.0, "gain_db": -2.0}
-
-
-def office() -> EchoModel:
-    """The robot in a room of 0.5 s, its reverberation 12 dB below the direct sound."""
-    rng, taps = np.random.default_rng(5), np.zeros(8000)
-    late = np.arange(8000 - 200)
-    taps[200:] = rng.standard_normal(late.size) * 10 ** (-3 * late / 8000)
-    return EchoModel(path()).with_effect("late_reverb", {"taps": taps * 0.25 / np.linalg.norm(taps)})
 
 
 @pytest.fixture(scope="module")

@@ -16,8 +16,8 @@ from edgefilter.echo.running import SourceChain, VoiceChain, reach, stream_form
 from edgefilter.echo.user_effects import load_effect
 from edgefilter.errors import UsageError
 from tests.diagnosis.robot_scene import profile, record, voice
+from tests.echo.own_effect import documented_file
 
-DOCUMENT = Path(__file__).parents[2] / "docs/own_effect.md"
 GOOD = """
 import numpy as np
 from edgefilter.echo.effect import Parameter
@@ -188,13 +188,6 @@ def test_what_follows_from_the_kind_of_a_users_effect(write, said, follows):
     load_effect(write(GOOD.replace('stage = "path"', said)))
     marks = ("scales_fan", "shows_in_silence", "learned", "lengthens")
     assert [mark for mark in marks if getattr(find("tilt"), mark)] == [follows] * bool(follows)
-
-
-def documented_file(folder: Path) -> Path:
-    """The example of the documentation, as a file of the name that it says."""
-    (code,) = re.findall(r"```python\n(\"\"\"blade_chop.py.*?)```", DOCUMENT.read_text(), re.S)
-    (folder / "blade_chop.py").write_text(code)
-    return folder / "blade_chop.py"
 
 
 def test_the_documented_effect_finds_its_own_parameters(tmp_path):

@@ -7,7 +7,7 @@ import soundfile
 from edgefilter import EgoFilter, Profile
 from edgefilter.filter.budget import DEMO
 from tests.as_before import levels_db, same_as_before
-from tests.filter.test_arrays import calibration, talk
+from tests.filter.array_scene import calibration, talk
 from tests.learning.scenes import Scene
 
 UNTIMED = ("engine", "engine_reason", "engines", "alignment", "linear_stage", "array", "samples")

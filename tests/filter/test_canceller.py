@@ -10,38 +10,12 @@ from scipy import signal
 
 from edgefilter.errors import SignalError
 from edgefilter.filter.canceller import COLD, LEARNED, Canceller, CancellerOutput, ShelfStates
+from tests.filter.canceller_scene import path, run, speechlike
 from tests.learning.scenes import loudspeaker, voice
 
 HOP = 256
 SETTLED = 6 * HOP
 """After 0.1 s the echo is raised by the shelf as if it had always been, to float32's precision."""
-
-
-def path(seed: int = 0, taps: int = 3000) -> np.ndarray:
-    """A decaying random path with its direct sound at 32 samples."""
-    rng = np.random.default_rng(seed)
-    h = 0.03 * rng.standard_normal(taps) * np.exp(-np.arange(taps) / 500)
-    h[:32] = 0.0
-    h[32] = 0.5
-    return h.astype(np.float32)
-
-
-def speechlike(seconds: float, seed: int = 1) -> np.ndarray:
-    """Coloured noise whose level moves at the rate of syllables."""
-    rng = np.random.default_rng(seed)
-    n = int(seconds * 16000)
-    noise = signal.lfilter([1.0], [1.0, -0.9], rng.standard_normal(n))
-    level = 0.55 + 0.45 * np.sin(2 * np.pi * 4 * np.arange(n) / 16000 + rng.uniform(0, 6))
-    return (0.03 * noise * level).astype(np.float32)
-
-
-def run(canceller: Canceller, mic: np.ndarray, reference: np.ndarray, located: bool = True) -> np.ndarray:
-    hop = canceller.hop
-    steps = [
-        canceller.step(mic[i : i + hop], reference[i : i + hop], located).error
-        for i in range(0, mic.size - hop + 1, hop)
-    ]
-    return np.concatenate((mic[:0], *steps))
 
 
 def db(x: np.ndarray) -> float:

@@ -13,7 +13,7 @@ from edgefilter.echo.running import SourceChain, VoiceChain
 from edgefilter.filter.canceller import Canceller
 from edgefilter.filter.residual_echo import Residual, Unpredictable
 from tests.conformance import robot_model, robot_speech, running_robot
-from tests.filter.test_canceller import path, run, speechlike
+from tests.filter.canceller_scene import path, run, speechlike
 
 STFT = StftConfig()
 

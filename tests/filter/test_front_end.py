@@ -16,7 +16,7 @@ from edgefilter.filter.echo_path import PathState, PathUpdate
 from edgefilter.filter.front_end import RUMBLE, FrontEnd
 from edgefilter.filter.residual_echo import Residual
 from edgefilter.types import SAMPLE_RATE
-from tests.engines.test_engines import robot
+from tests.conformance import robot
 
 
 def test_without_a_profile_rumble_is_lowered_and_with_one_it_is_as_it_was():

@@ -8,11 +8,10 @@ from edgefilter import Profile, engines, enhance
 from edgefilter.echo.model import EchoModel
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE
 from tests.alignment.scene import speech_like
+from tests.filter.loudness import loudest_over_mic_db
 
 SECONDS = 6
 SIZE = SECONDS * SAMPLE_RATE
-INAUDIBLE = 1e-9
-"""Mean square, -90 dB of full scale, added to both sides: of digital silence nothing can be a decibel louder."""
 ENGINES = tuple(name for name in engines.ENGINES if name != "paper-crnn")
 """All that are shipped: the network of paper-crnn is not."""
 
@@ -117,14 +116,6 @@ def profile() -> Profile:
 @pytest.fixture(scope="module")
 def calibrated() -> Profile:
     return profile()
-
-
-def loudest_over_mic_db(mic: np.ndarray, out: np.ndarray) -> float:
-    """Largest level of out over mic, any second, steps of 50 ms."""
-    before, after = (np.concatenate(([0.0], np.cumsum(np.square(x, dtype=np.float64)))) for x in (mic, out))
-    at = np.arange(0, mic.size - SAMPLE_RATE, SAMPLE_RATE // 20)
-    powers = [(total[at + SAMPLE_RATE] - total[at]) / SAMPLE_RATE + INAUDIBLE for total in (before, after)]
-    return float((10 * np.log10(powers[1] / powers[0])).max())
 
 
 @pytest.mark.slow

@@ -11,8 +11,8 @@ from edgefilter.echo.model import EchoModel
 from edgefilter.filter.canceller import Canceller
 from edgefilter.filter.echo_path import EchoPath
 from edgefilter.types import PRE_ROLL
+from tests.conformance import robot
 from tests.diagnosis.robot_scene import profile, record, voice
-from tests.engines.test_engines import robot
 
 
 def echo_of(profile, reference, delay=900):

@@ -19,7 +19,7 @@ from edgefilter.dsp.stft import StftConfig
 from edgefilter.errors import SignalError
 from edgefilter.filter.residual_echo import Residual
 from edgefilter.types import SAMPLE_RATE
-from tests.filter.test_hostile_inputs import loudest_over_mic_db
+from tests.filter.loudness import loudest_over_mic_db
 
 DEMO = Path(edgefilter.__file__).parent / "demo_data"
 TINY = Path(__file__).parents[1] / "data" / "crnn.onnx"

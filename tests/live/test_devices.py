@@ -10,7 +10,7 @@ import pytest
 import soundfile
 import soxr
 
-from tests.filter.test_arrays import calibration
+from tests.filter.array_scene import calibration
 from tests.program import argv
 
 pytestmark = pytest.mark.slow

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from tests.live.test_virtual_microphone import arrived
+from tests.live.arrived import arrived
 from tests.program import DEMO, ROOT, argv
 
 pytestmark = pytest.mark.slow

@@ -8,26 +8,12 @@ import pytest
 import soundfile
 
 from edgefilter.cli import main
+from tests.live.arrived import arrived
 from tests.program import DEMO, ROOT, argv
 
 pytestmark = pytest.mark.slow
 
 NAMES = ("edgefilter_speaker", "edgefilter_human", "edgefilter_mic")
-
-
-def arrived(heard, played):
-    """The greatest correlation coefficient that any 0.2 s of played have with what was heard.
-
-    On a machine that is busy with something else the sound server leaves gaps; a piece that came through shows the way.
-    """
-    size = 1 << int(np.ceil(np.log2(heard.size + 3200)))
-    spectrum = np.fft.rfft(heard, size)
-    energy = np.convolve(np.square(heard), np.ones(3200), "valid")
-    best = 0.0
-    for piece in np.split(played[: played.size // 3200 * 3200], played.size // 3200):
-        product = np.fft.irfft(spectrum * np.conj(np.fft.rfft(piece, size)), size)[: energy.size]
-        best = max(best, float(np.max(product / np.sqrt(np.maximum(energy, 1e-3) * np.sum(piece**2)))))
-    return best
 
 
 def test_others_listen_to_the_virtual_microphone_and_the_robot_plays_into_the_virtual_speaker(
