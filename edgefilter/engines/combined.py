@@ -25,13 +25,13 @@ JUDGE = "crnn"
 class Voice:
     """One engine at work: its index, its state, and its answers that wait where another engine looks further ahead."""
 
-    rung: int
+    index: int
     state: EngineState
     waiting: tuple[Output, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class LadderState:
+class FallbackState:
     """The engine whose output is heard, the one that fades in (if any), the frames until it can, and its weight, 0 to 1."""
 
     heard: Voice
@@ -40,79 +40,79 @@ class LadderState:
     weight: float = 0.0
 
 
-class Ladder:
-    """An engine that runs one of its rungs; set `wanted` and it crossfades there, frame by frame.
+class Fallback:
+    """An engine that runs one of several; set `wanted`, an index, and it crossfades there, frame by frame.
 
-    rungs: best first, all with the same STFT and front, so that alignment and linear stage run on untouched; their
+    ranked: best first, all with the same STFT and front, so that alignment and linear stage run on untouched; their
     look-aheads may differ, all answers come out as late as the latest. A request during a crossfade turns it back, or
-    is met after it. Raises UsageError without rungs, or where they differ in STFT or front.
+    is met after it. Raises UsageError without any, or where they differ in STFT or front.
     """
 
-    name: ClassVar[str] = "ladder"
+    name: ClassVar[str] = "fallback"
 
-    def __init__(self, rungs: Sequence[Engine]) -> None:
-        if not rungs:
+    def __init__(self, ranked: Sequence[Engine]) -> None:
+        if not ranked:
             raise UsageError("no engine to run: name at least one")
-        for rung in rungs[1:]:
-            if not _take_turns(rung, rungs[0]):
+        for other in ranked[1:]:
+            if not _take_turns(other, ranked[0]):
                 raise UsageError(
-                    f"engines {rungs[0].name} and {rung.name} cannot take turns: their STFTs or fronts differ"
+                    f"engines {ranked[0].name} and {other.name} cannot take turns: their STFTs or fronts differ"
                 )
-        self.rungs = tuple(rungs)
-        self.stft = rungs[0].stft
-        self.front: FrontEndKind = rungs[0].front
-        self.lookahead = max(rung.lookahead for rung in rungs)
+        self.engines = tuple(ranked)
+        self.stft = ranked[0].stft
+        self.front: FrontEndKind = ranked[0].front
+        self.lookahead = max(one.lookahead for one in ranked)
         self.wanted = 0
 
-    def initial_state(self) -> LadderState:
-        return LadderState(self._start(self.wanted))
+    def initial_state(self) -> FallbackState:
+        return FallbackState(self._start(self.wanted))
 
-    def step(self, frame: Frame, state: LadderState) -> tuple[Output, LadderState]:
-        if state.coming is None and self.wanted != state.heard.rung:
-            state = LadderState(state.heard, self._start(self.wanted), self.lookahead)
+    def step(self, frame: Frame, state: FallbackState) -> tuple[Output, FallbackState]:
+        if state.coming is None and self.wanted != state.heard.index:
+            state = FallbackState(state.heard, self._start(self.wanted), self.lookahead)
         output, heard = self._run(state.heard, frame)
         if state.coming is None:
-            return output, LadderState(heard)
+            return output, FallbackState(heard)
         other, coming = self._run(state.coming, frame)
-        weight = state.weight if state.filling else self._move(state.weight, state.heard.rung, state.coming.rung)
-        if weight == 0.0 and self.wanted == heard.rung:
-            return output, LadderState(heard)
+        weight = state.weight if state.filling else self._move(state.weight, state.heard.index, state.coming.index)
+        if weight == 0.0 and self.wanted == heard.index:
+            return output, FallbackState(heard)
         if weight == 1.0:
-            return other, LadderState(coming)
+            return other, FallbackState(coming)
         spectrum = output.spectrum + np.float32(weight) * (other.spectrum - output.spectrum)
         louder = output if weight < 0.5 else other
-        return Output(spectrum, louder.speech_probability), LadderState(
+        return Output(spectrum, louder.speech_probability), FallbackState(
             heard, coming, max(state.filling - 1, 0), weight
         )
 
-    def _move(self, weight: float, *rungs: int) -> float:
-        """The next weight of the voice that is coming in (rungs: heard, coming), towards whichever of the two is nearer to what is wanted."""
-        goal = 1 if abs(self.wanted - rungs[1]) < abs(self.wanted - rungs[0]) else 0
-        step = 1.0 / (DOWN if rungs[goal] == max(rungs) else UP)
+    def _move(self, weight: float, *indices: int) -> float:
+        """The next weight of the voice that is coming in (indices: heard, coming), towards whichever of the two is nearer to what is wanted."""
+        goal = 1 if abs(self.wanted - indices[1]) < abs(self.wanted - indices[0]) else 0
+        step = 1.0 / (DOWN if indices[goal] == max(indices) else UP)
         return min(weight + step, 1.0) if goal else max(weight - step, 0.0)
 
-    def _start(self, rung: int) -> Voice:
-        engine = self.rungs[rung]
+    def _start(self, index: int) -> Voice:
+        engine = self.engines[index]
         silence = Output(np.zeros(self.stft.bins, np.complex64))
-        return Voice(rung, engine.initial_state(), (silence,) * (self.lookahead - engine.lookahead))
+        return Voice(index, engine.initial_state(), (silence,) * (self.lookahead - engine.lookahead))
 
     def _run(self, voice: Voice, frame: Frame) -> tuple[Output, Voice]:
-        output, state = self.rungs[voice.rung].step(frame, voice.state)
+        output, state = self.engines[voice.index].step(frame, voice.state)
         first, *rest = (*voice.waiting, output)
-        return first, Voice(voice.rung, state, tuple(rest))
+        return first, Voice(voice.index, state, tuple(rest))
 
 
-def climbable(best: Engine, profile: Profile | None) -> list[Engine]:
+def fallbacks(best: Engine, profile: Profile | None) -> list[Engine]:
     """The best candidate and the cheaper ones that can take turns with it: those that can be made with its STFT and front."""
-    rungs, names = [best], engines.CANDIDATES
+    found, names = [best], engines.CANDIDATES
     for name in names[names.index(best.name) + 1 :] if best.name in names else ():
         try:
             engine = cast(Engine, engines.create(name, profile, best.stft))  # no candidate needs the whole recording
         except EdgefilterError:
             continue
         if _take_turns(engine, best):
-            rungs.append(engine)
-    return rungs
+            found.append(engine)
+    return found
 
 
 def _take_turns(one: Engine, other: Engine) -> bool:

@@ -12,7 +12,7 @@ from edgefilter import engines
 from edgefilter.alignment.utterances import MOST_ANNOUNCED, MOST_ANNOUNCED_S
 from edgefilter.dsp.resample import at_16_khz, from_16_khz
 from edgefilter.engines.base import ClipEngine, Engine
-from edgefilter.engines.combined import Ladder, climbable, judges_speech, with_network_as_judge
+from edgefilter.engines.combined import Fallback, fallbacks, judges_speech, with_network_as_judge
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.echo_path import Learner
@@ -124,7 +124,7 @@ class EgoFilter:
         network_judges = barge_in is not None and barge_in.judge == "network"
         if network_judges:
             best = with_network_as_judge(best, self.profile)
-        ladder = None
+        fallback = None
         if budget_ms is not None:
             if network_judges or best.lookahead is None:
                 why = (
@@ -132,20 +132,20 @@ class EgoFilter:
                 )
                 self.engine_reason += f"; a budget of {budget_ms:g} ms does not change the engine: {why}"
             else:
-                ladder = Ladder(climbable(best, self.profile))
-        stepping = Stepping(best.stft.hop, ladder, budget_ms)
+                fallback = Fallback(fallbacks(best, self.profile))
+        stepping = Stepping(best.stft.hop, fallback, budget_ms)
         hooks = on_barge_in, keep_channels, on_suspicion, output
-        self._stream = Stream(ladder or best, self.profile, stepping, barge_in, learn, *hooks)
+        self._stream = Stream(fallback or best, self.profile, stepping, barge_in, learn, *hooks)
 
     @property
     def _engines(self) -> Sequence[Engine | ClipEngine]:
         engine = self._stream.engine
-        return engine.rungs if isinstance(engine, Ladder) else (engine,)
+        return engine.engines if isinstance(engine, Fallback) else (engine,)
 
     @property
     def _engine(self) -> Engine | ClipEngine:
         engine = self._stream.engine
-        return engine.rungs[engine.wanted] if isinstance(engine, Ladder) else engine
+        return engine.engines[engine.wanted] if isinstance(engine, Fallback) else engine
 
     @property
     def engine_name(self) -> str:

@@ -6,7 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-from edgefilter.engines.combined import Ladder
+from edgefilter.engines.combined import Fallback
 from edgefilter.filter.timing import Histogram
 from edgefilter.types import SAMPLE_RATE, DeadlineStats, EventKind
 
@@ -22,20 +22,20 @@ class Stepping:
     """Watches the compute time of each hop of one stream.
 
     A hop misses its deadline where its compute took longer than the hop lasts; it is over the budget where it took
-    longer than budget_ms, or than the hop. Where OVERLOADED of the last second are over the budget, the ladder is asked
-    for the next cheaper engine, and after PATIENCE_S of calm for the next better one. ladder: None to count only.
+    longer than budget_ms, or than the hop. Where OVERLOADED of the last second are over the budget, the fallback is asked
+    for the next cheaper engine, and after PATIENCE_S of calm for the next better one. fallback: None to count only.
     """
 
     def __init__(
         self,
         hop: int,
-        ladder: Ladder | None = None,
+        fallback: Fallback | None = None,
         budget_ms: float | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         self.hop_ms = 1000 * hop / SAMPLE_RATE
         self.budget_ms = self.hop_ms if budget_ms is None else min(budget_ms, self.hop_ms)
-        self.ladder = ladder
+        self.fallback = fallback
         self.clock = clock
         self._window = self._hops(1.0)
         self.reset()
@@ -51,8 +51,8 @@ class Stepping:
         self._patience_s = PATIENCE_S
         self._since_up: int | None = None
         self._told = False
-        if self.ladder:
-            self.ladder.wanted = 0
+        if self.fallback:
+            self.fallback.wanted = 0
 
     def note(self, compute_s: float) -> tuple[EventKind, str] | None:
         """Take the compute time of one hop; return what happened and in which words, if anything did."""
@@ -94,17 +94,17 @@ class Stepping:
         self._recent.clear()
         self._late = 0
         self._calm_hops = self._calm_late = 0
-        if self.ladder is None or self.ladder.wanted == len(self.ladder.rungs) - 1:
+        if self.fallback is None or self.fallback.wanted == len(self.fallback.engines) - 1:
             first, self._told = not self._told, True
             return ("overloaded", f"{why} and there is no cheaper engine to step down to") if first else None
         if self._since_up is not None:
             failed = self._since_up < self._hops(self._patience_s)
             self._patience_s = min(2 * self._patience_s, MOST_PATIENCE_S) if failed else PATIENCE_S
         self._since_up = None
-        return "stepped_down", f"{self._move(self.ladder, 1)}: {why}"
+        return "stepped_down", f"{self._move(self.fallback, 1)}: {why}"
 
     def _up(self) -> tuple[EventKind, str] | None:
-        if self.ladder is None or self.ladder.wanted == 0:
+        if self.fallback is None or self.fallback.wanted == 0:
             return None
         calm = self._hops(self._patience_s)
         if self._calm_late > CALM * calm:
@@ -112,10 +112,10 @@ class Stepping:
         if self._calm_hops < calm:
             return None
         self._calm_hops = self._calm_late = self._since_up = 0
-        return "stepped_up", f"{self._move(self.ladder, -1)}: {self._patience_s:.0f} s within {self.budget_ms:.1f} ms"
+        return "stepped_up", f"{self._move(self.fallback, -1)}: {self._patience_s:.0f} s within {self.budget_ms:.1f} ms"
 
-    def _move(self, ladder: Ladder, by: int) -> str:
-        before = ladder.rungs[ladder.wanted].name
-        ladder.wanted += by
+    def _move(self, fallback: Fallback, by: int) -> str:
+        before = fallback.engines[fallback.wanted].name
+        fallback.wanted += by
         self.steps += 1
-        return f"from {before} to {ladder.rungs[ladder.wanted].name}"
+        return f"from {before} to {fallback.engines[fallback.wanted].name}"

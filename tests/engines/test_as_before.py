@@ -6,7 +6,7 @@ import soundfile
 
 from edgefilter import EgoFilter, Profile
 from edgefilter.engines import create
-from edgefilter.engines.combined import Ladder, climbable, with_network_as_judge
+from edgefilter.engines.combined import Fallback, fallbacks, with_network_as_judge
 from edgefilter.filter.budget import DEMO
 from edgefilter.filter.stream import Stream
 from tests.as_before import levels_db, same_as_before
@@ -50,11 +50,18 @@ def test_with_the_network_as_judge() -> None:
 def test_in_turn() -> None:
     """From the best to the cheapest, back, and back again before the crossfade has ended."""
     mic, ref, profile = demo()
-    ladder = Ladder(climbable(create("crnn", profile), profile))
-    wanted = {40: len(ladder.rungs) - 1, 80: 0, 130: len(ladder.rungs) - 1, 132: 0, 160: 1, 170: len(ladder.rungs) - 1}
-    hop, out = ladder.stft.hop, []
-    stream = Stream(ladder, profile)
+    fallback = Fallback(fallbacks(create("crnn", profile), profile))
+    wanted = {
+        40: len(fallback.engines) - 1,
+        80: 0,
+        130: len(fallback.engines) - 1,
+        132: 0,
+        160: 1,
+        170: len(fallback.engines) - 1,
+    }
+    hop, out = fallback.stft.hop, []
+    stream = Stream(fallback, profile)
     for count, at in enumerate(range(0, ref.size, hop)):
-        ladder.wanted = wanted.get(count, ladder.wanted)
+        fallback.wanted = wanted.get(count, fallback.wanted)
         out.append(stream.process(mic[at : at + hop], ref[at : at + hop]))
     same_as_before("engines_in_turn", {"out": levels_db(np.concatenate(out), hop / 16000)[:220]}, 0.05)

@@ -12,7 +12,7 @@ import pytest
 from edgefilter import EgoFilter
 from edgefilter.commands.run import garbage_of_this_run_only
 from edgefilter.dsp.stft import StftConfig
-from edgefilter.engines.combined import DOWN, UP, Ladder, climbable
+from edgefilter.engines.combined import DOWN, UP, Fallback, fallbacks
 from edgefilter.engines.linear import Bypass, Linear
 from edgefilter.engines.paper_ss import PAPER_STFT
 from edgefilter.engines.spectral_subtraction import SpectralSubtraction
@@ -75,7 +75,7 @@ class Slow(Bypass):
 
 
 def run(stream, mic, ref, wanted):
-    """Hop by hop; before hop h the ladder is asked for rung wanted[h], where there is such an entry."""
+    """Hop by hop; before hop h the fallback is asked for engine wanted[h], where there is such an entry."""
     out = []
     for hop, at in enumerate(range(0, mic.size, HOP)):
         stream.engine.wanted = wanted.get(hop, stream.engine.wanted)
@@ -83,27 +83,27 @@ def run(stream, mic, ref, wanted):
     return np.concatenate((*out, stream.flush()))
 
 
-@pytest.mark.parametrize("rungs", [(Late, Linear), (SpectralSubtraction, Linear)], ids=str)
+@pytest.mark.parametrize("ranked", [(Late, Linear), (SpectralSubtraction, Linear)], ids=str)
 @pytest.mark.parametrize("check", conformance.CHECKS, ids=lambda c: c.__name__.removeprefix("check_"))
-def test_ladder_conforms(check, rungs):
-    kinds = [rung() for rung in rungs]
+def test_fallback_conforms(check, ranked):
+    kinds = [index() for index in ranked]
     for kind in kinds:
         kind.front = "full"
-    check(lambda: Stream(Ladder(kinds)))
+    check(lambda: Stream(Fallback(kinds)))
 
 
-def test_a_ladder_at_rest_is_its_rung_bit_for_bit():
+def test_a_fallback_at_rest_is_its_engine_bit_for_bit():
     mic, ref = conformance.conversation()
-    for rung, engine in enumerate((SpectralSubtraction(), Linear())):
-        ladder = Ladder((SpectralSubtraction(), Linear()))
-        ladder.wanted = rung
-        assert np.array_equal(conformance.run(Stream(ladder), mic, ref), conformance.run(Stream(engine), mic, ref))
+    for index, engine in enumerate((SpectralSubtraction(), Linear())):
+        fallback = Fallback((SpectralSubtraction(), Linear()))
+        fallback.wanted = index
+        assert np.array_equal(conformance.run(Stream(fallback), mic, ref), conformance.run(Stream(engine), mic, ref))
 
 
-@pytest.mark.parametrize("rungs", [(Bypass, Late), (Late, Bypass)])
-def test_stepping_between_different_look_aheads_keeps_every_sample_in_its_place(rungs):
+@pytest.mark.parametrize("ranked", [(Bypass, Late), (Late, Bypass)])
+def test_stepping_between_different_look_aheads_keeps_every_sample_in_its_place(ranked):
     mic, ref = conformance.conversation(40_001)
-    out = run(Stream(Ladder([rung() for rung in rungs])), mic, ref, {20: 1, 60: 0, 61: 1, 110: 0, 112: 1, 113: 0})
+    out = run(Stream(Fallback([index() for index in ranked])), mic, ref, {20: 1, 60: 0, 61: 1, 110: 0, 112: 1, 113: 0})
     assert out.size == mic.size
     np.testing.assert_allclose(out, mic, atol=1e-6)  # float32 rounding of the blend
 
@@ -116,9 +116,9 @@ class LateAndQuiet(Late):
         return Output(output.spectrum * np.float32(0.1)), state
 
 
-def test_a_ladder_gets_to_a_rung_that_looks_ahead():
+def test_a_fallback_gets_to_a_rung_that_looks_ahead():
     mic = np.full(20_000, 0.5, np.float32)
-    out = run(Stream(Ladder((Bypass(), LateAndQuiet()))), mic, np.zeros_like(mic), {20: 1})
+    out = run(Stream(Fallback((Bypass(), LateAndQuiet()))), mic, np.zeros_like(mic), {20: 1})
     np.testing.assert_allclose(out[(22 + DOWN + 3) * HOP : -HOP], 0.05, atol=1e-6)
 
 
@@ -126,7 +126,7 @@ def test_alignment_and_linear_stage_run_on_through_a_step():
     """Outside of the crossfades the output is that of the engine in use, as if it had been alone from the start."""
     mic, ref = conformance.conversation(60_000)
     alone = [conformance.run(Stream(engine), mic, ref) for engine in (SpectralSubtraction(), Linear())]
-    stream = Stream(Ladder((SpectralSubtraction(), Linear())))
+    stream = Stream(Fallback((SpectralSubtraction(), Linear())))
     out = run(stream, mic, ref, {100: 1, 160: 0})
     assert out.size == mic.size
     assert np.array_equal(out[: 98 * HOP], alone[0][: 98 * HOP])  # the output of hop h ends one window before hop h + 1
@@ -142,7 +142,7 @@ def test_a_step_does_not_click():
     """A 200 Hz tone that falls by 20 dB: what appears above 1 kHz is a click."""
     mic = (0.5 * np.sin(2 * np.pi * 200 / SAMPLE_RATE * np.arange(32_000))).astype(np.float32)
     nothing = np.zeros_like(mic)
-    out = run(Stream(Ladder((Bypass(), Quiet()))), mic, nothing, {40: 1, 80: 0})
+    out = run(Stream(Fallback((Bypass(), Quiet()))), mic, nothing, {40: 1, 80: 0})
     cut = np.where((np.arange(mic.size) // HOP < 40) | (np.arange(mic.size) // HOP >= 80), mic, np.float32(0.1) * mic)
 
     def click_db(x):
@@ -160,7 +160,7 @@ def test_a_step_does_not_click():
 def test_a_request_during_a_crossfade_turns_it_back():
     """Up and, half way, down again: the better engine is never heard alone, and the weight never jumps."""
     mic = np.full(20_000, 0.5, np.float32)
-    out = run(Stream(Ladder((Bypass(), Quiet()))), mic, np.zeros_like(mic), {0: 1, 30: 0, 30 + UP // 2: 1})
+    out = run(Stream(Fallback((Bypass(), Quiet()))), mic, np.zeros_like(mic), {0: 1, 30: 0, 30 + UP // 2: 1})
     level = out[20 * HOP :: HOP] / 0.5
     assert level.min() == pytest.approx(0.1, abs=1e-6) and level.max() == pytest.approx(0.1 + 0.9 / 2, abs=0.9 / UP)
     assert np.diff(level).max() <= 0.9 / UP + 1e-6 and np.diff(level).min() >= -0.9 / DOWN - 1e-6
@@ -168,20 +168,20 @@ def test_a_request_during_a_crossfade_turns_it_back():
     assert level[peak + DOWN] == pytest.approx(0.1, abs=1e-6)
 
 
-def test_rungs_that_cannot_take_turns_are_refused():
+def test_engines_that_cannot_take_turns_are_refused():
     with pytest.raises(UsageError, match="bypass and linear cannot take turns"):
-        Ladder((Bypass(), Quiet(), Linear()))
+        Fallback((Bypass(), Quiet(), Linear()))
     with pytest.raises(UsageError, match="STFT"):
-        Ladder((Linear(), Linear(StftConfig(n_fft=512, hop=128))))
+        Fallback((Linear(), Linear(StftConfig(n_fft=512, hop=128))))
     with pytest.raises(UsageError, match="no engine"):
-        Ladder(())
+        Fallback(())
 
 
 def test_cheaper_engines_take_the_stft_of_the_best():
     stft = StftConfig(n_fft=320, hop=160, window_length=320)
-    rungs = climbable(SpectralSubtraction(stft), None)
-    assert [(rung.name, rung.stft) for rung in rungs] == [("ss", stft), ("linear", stft)]
-    assert [rung.name for rung in climbable(Bypass(PAPER_STFT), None)] == ["bypass"]
+    ranked = fallbacks(SpectralSubtraction(stft), None)
+    assert [(index.name, index.stft) for index in ranked] == [("ss", stft), ("linear", stft)]
+    assert [index.name for index in fallbacks(Bypass(PAPER_STFT), None)] == ["bypass"]
 
 
 def overloaded_stream(cost_s, budget_ms=8.0):
@@ -191,8 +191,8 @@ def overloaded_stream(cost_s, budget_ms=8.0):
         clock.now += seconds
 
     slow = Slow(wait, cost_s)
-    ladder = Ladder((slow, Bypass(), Quiet()))
-    return slow, Stream(ladder, None, Stepping(HOP, ladder, budget_ms, clock))
+    fallback = Fallback((slow, Bypass(), Quiet()))
+    return slow, Stream(fallback, None, Stepping(HOP, fallback, budget_ms, clock))
 
 
 def feed(stream, seconds):
@@ -284,8 +284,8 @@ def test_under_real_load_on_all_cores_a_slow_engine_is_left_and_no_sample_is_los
     mic, ref = conformance.conversation(48_000)
     slow = Slow(time.sleep, 0.017)
     slow.front = "full"
-    ladder = Ladder((slow, Linear()))
-    stepped = Stream(ladder, None, Stepping(HOP, ladder))
+    fallback = Fallback((slow, Linear()))
+    stepped = Stream(fallback, None, Stepping(HOP, fallback))
     out = conformance.run(stepped, mic, ref, [160, 255, 1000])
     assert [event.kind for event in stepped.events if event.kind == "stepped_down"] == ["stepped_down"]
     assert stepped.stepping.stats()["missed_deadlines"] >= 0.25 * HOPS_A_SECOND

@@ -154,7 +154,7 @@ def run_for(server, seconds, tmp_path, *more):
 
 
 def test_live_an_engine_over_its_budget_is_left_and_every_sample_is_there(server, tmp_path):
-    """No machine runs a hop in 1 us, so that both engines of the ladder are over the budget."""
+    """No machine runs a hop in 1 us, so that both engines of the fallback are over the budget."""
     said, stats = run_for(server, 3, tmp_path, "--engine", "ss", "--budget-ms", "0.001")
     assert "stepped down from ss to linear" in said and "overloaded" in said
     kinds = [event["kind"] for event in stats["events"]]
