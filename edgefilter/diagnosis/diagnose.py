@@ -71,7 +71,7 @@ def conclude(
     part = share_of(
         found.base.excess_db, found.final.excess_db
     )  # enough to be named beside something that none explains
-    partly = part >= criteria.half and explained_level(found) >= criteria.part_level
+    partly = part >= criteria.half and explained_level(found) >= criteria.part
     if not believed and (quiet or not partly):
         shown = {step.name: step.values for step in found.steps if find(step.name).shows_in_silence}
         found = found.with_only(shown)  # silences and voice both show it

@@ -158,7 +158,7 @@ class Workbench:
     def little(self, model: EchoModel) -> bool:
         """Whether a model leaves so little of what the profile leaves that the right effects may be in it."""
         was, left = (self.score(each).active_db for each in (self.recording.model, model))
-        gone = left <= 0.0 or share_of(was, left) >= 1.0 - self.criteria.nothing
+        gone = left <= 0.0 or share_of(was, left) >= self.criteria.nearly
         return gone and self.off_db(model) <= self.criteria.little_db
 
     def left(self, model: EchoModel) -> float:
@@ -268,7 +268,7 @@ class Workbench:
 
     def _settles(self, trial: Trial, model: EchoModel) -> bool:
         """Whether a trial on a model can be named and leaves next to nothing."""
-        little = self.left(trial.model) <= self.criteria.nothing * self.left(model)
+        little = self.left(trial.model) <= (1.0 - self.criteria.nearly) * self.left(model)
         return little and self.explained(trial.model) and self.admissible(trial)
 
     def worth(self, trial: Trial, model: EchoModel) -> bool:
