@@ -9,7 +9,7 @@ from pathlib import Path
 
 from edgefilter.audio.files import whole
 from edgefilter.commands.add import Fitted, Refused, fit
-from edgefilter.commands.display import print_result, progress, report_part
+from edgefilter.commands.display import interject, print_result, progress, report_part
 from edgefilter.commands.recordings import load, load_array
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.recording import Recording
@@ -18,7 +18,15 @@ from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.effects.catalogue import names as known_effects
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
 from edgefilter.profile.array import ArrayCalibration
-from edgefilter.report.text import LINES, MORE, add_command, diagnosis_lines, next_command, summary_lines
+from edgefilter.report.text import (
+    LINES,
+    MORE,
+    add_command,
+    diagnosis_lines,
+    first_sight_line,
+    next_command,
+    summary_lines,
+)
 
 
 def main(args: argparse.Namespace) -> None:
@@ -40,6 +48,8 @@ def main(args: argparse.Namespace) -> None:
         print_result(args, [f"channel {number}: {what}" for number, what in doubts.items()])
     with progress("diagnosis") as step:
         criteria = Criteria(false_rate=args.false_rate)
+        seen = recording.at_first_sight(criteria)
+        interject(first_sight_line(seen))
         diagnosed = recording.diagnose_proven if args.prove else recording.diagnose
         found = diagnosed(progress=step, criteria=criteria)
         if not recording.known:
@@ -66,6 +76,7 @@ def main(args: argparse.Namespace) -> None:
         lines = [*diagnosis_lines(found, calibrated), *told]
     else:
         lines = [*summary_lines(found, calibrated, LINES - 2 - len(told)), *told, MORE]
+    more["at_first_sight"] = {family: round(gain_db, 2) for family, gain_db in seen.items()}
     print_result(args, lines, {**found.to_dict(), **more})
     if html:
         with progress("page of the diagnosis"):

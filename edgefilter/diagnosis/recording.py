@@ -11,6 +11,7 @@ from edgefilter.calibration.from_recording import self_calibrate
 from edgefilter.diagnosis.compare import Comparison, describe
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import as_written, conclude
+from edgefilter.diagnosis.first_sight import at_first_sight
 from edgefilter.diagnosis.joint import fit_jointly
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.probe import Inquiry
@@ -98,6 +99,21 @@ class Recording:
     def compare(self) -> Comparison:
         """Say how far the profile's prediction is from the recording, and where: `compare`."""
         return describe(self.straightened, self.straightened.model)
+
+    def at_first_sight(self, criteria: Criteria | None = None) -> dict[str, float]:
+        """Say within a second or two which families of effects the profile lacks, and by how many dB each lowers what is left.
+
+        Parameters
+        ----------
+        criteria : Criteria, optional
+            How rarely a family is told by chance.
+
+        Returns
+        -------
+        dict of str to float
+            The largest first; empty where none is seen. `diagnose` says what it is, also behind the first one.
+        """
+        return at_first_sight(self.straightened, criteria or Criteria())
 
     def diagnose(
         self,

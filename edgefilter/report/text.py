@@ -120,6 +120,12 @@ def comparison_lines(found: Comparison) -> list[str]:
     return lines + independence_lines(found.independence)
 
 
+def first_sight_line(seen: Mapping[str, float]) -> str:
+    """Say which families of effects explain how many dB of the loudest seconds, before any of them has a name."""
+    parts = ", ".join(f"{family} {gain_db:.1f} dB" for family, gain_db in seen.items())
+    return f"at first sight {parts or 'no family of effects explains more than chance does'}"
+
+
 def summary_lines(found: Diagnosis, calibrated: bool = True, most: int = LINES - 2) -> list[str]:
     """Format what a person needs to go on: what is wrong, how sure that is, what is left, and as many warnings and hints as fit.
 

@@ -1,0 +1,69 @@
+"""Within a second: which families of effects a recording shows, and how much each, by their free laws on its loudest seconds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from edgefilter.diagnosis.criteria import Criteria
+from edgefilter.diagnosis.ordinary import p_value
+from edgefilter.diagnosis.straightened import Straightened
+from edgefilter.echo.effect import Effect, vanishes
+from edgefilter.echo.effects.catalogue import EFFECTS
+from edgefilter.echo.effects.gain_fit import EXCERPT, excerpt
+from edgefilter.echo.recording import BLOCK
+from edgefilter.errors import UsageError
+
+
+def at_first_sight(recording: Straightened, criteria: Criteria) -> dict[str, float]:
+    """By how many dB another volume, and beside it the best free law of each family, lower the held-out level of the loudest seconds.
+
+    The largest first, and only those that do so by more than chance. A family that is hidden behind another one is not seen yet.
+    """
+    part = _loudest(recording)
+    before, turned = (part.of(part.model, any_volume).level_db for any_volume in (False, True))
+    found = {"volume": before - turned}
+    for effect in (each for each in EFFECTS if each.free or each.stage == "noise" or _is_response(each)):
+        try:
+            values = part.model.fitted(effect.name, part.measurement)
+        except (UsageError, ArithmeticError, np.linalg.LinAlgError):
+            continue
+        if vanishes(effect, values):
+            continue
+        gain_db = min(before, turned) - part.of(part.model.with_effect(effect.name, values)).level_db
+        if p_value(effect.name, gain_db) <= criteria.false_rate:
+            found[effect.family] = max(found.get(effect.family, 0.0), gain_db)
+    if (
+        p_value("volume", found["volume"]) > criteria.false_rate
+    ):  # no effect's name: as rare as by the one that explains most
+        del found["volume"]
+    return dict(sorted(found.items(), key=lambda entry: -entry[1]))
+
+
+def _is_response(effect: Effect) -> bool:
+    """Whether an effect is another impulse response: as free as a law, and longer than that of the linear path."""
+    return effect.stage == "response" and effect.flexible and not effect.event
+
+
+def _loudest(recording: Straightened) -> Straightened:
+    """Of a recording the stretch that a gain is fitted to; in its first half second the echo of what came before is missing."""
+    measurement = recording.measurement
+    part = excerpt(measurement, recording.model, EXCERPT)
+    usable = recording.usable[part].copy()
+    if part.start:
+        usable[:BLOCK] = False
+    cut = replace(
+        measurement,
+        reference=measurement.reference[part],
+        recording=measurement.recording[part],
+        fit=recording.fit[part] & usable,
+    )
+    return replace(
+        recording,
+        measurement=cut,
+        prediction=recording.prediction[part],
+        usable=usable,
+        active=recording.active[part],
+        ordinary=tuple((variance[part], colour) for variance, colour in recording.ordinary),
+    )
