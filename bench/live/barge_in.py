@@ -360,7 +360,7 @@ def tables(rows: Sequence[Mapping], alone: Sequence[Mapping], points: Mapping[st
                       ["loudspeaker, filter", "robots", ("minutes of speech", 1), ("distinct", 1), "voices", "stops", ("an hour", 1),
                        "suspected", "asked"],
                       [[name, *false_stops(part)] for name, part in groups(alone).items() if part],
-                      "Suspected, but not asked: while the robot is silent, or where a lower voice would be heard too late."),
+                      "Suspected, but not asked: the robot was silent, or its lowered voice would have reached the microphone too late."),
         results.table("threshold", "By the threshold of the probability, simulated robots",
                       ["filter", "threshold", (f"within {IN_TIME_S} s, %", 0), ("false stops an hour", 1)],
                       [[start, point["threshold"], 100 * point["in_time"], point["per_hour"]]

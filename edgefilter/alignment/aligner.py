@@ -26,8 +26,8 @@ LIKELY_LAG_S = 2.0
 LATE = SAMPLE_RATE // 10
 """Samples by which a reference may come after its echo and is still found for an utterance; with LATEST they are found .15 s later."""
 LATEST, FURTHEST, STRETCH = 2 * SAMPLE_RATE, 5 * SAMPLE_RATE, 3 * SAMPLE_RATE
-"""The same in a look that supposes no beginning of an utterance, the most lag there, which is told but not followed, and samples of the
-microphone in it, so that a second is left at any."""
+"""Of a look, a search that supposes no beginning of an utterance: samples by which the reference may come after its echo, the longest
+lag, which is told but not followed, and samples of the microphone, of which a second is compared even at that lateness."""
 LOOKS, FIRST_LOOK, NEXT_LOOK = 12, SAMPLE_RATE // 2, SAMPLE_RATE
 """Looks that are remembered, samples of an utterance after which there is one, and from one to the next; one more at each realignment.
 Speech that begins while the reference is silent waits for as long until it is nobody's but a human's: the reference may follow."""

@@ -18,7 +18,7 @@ from edgefilter.errors import SignalError
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 REACH = round(MOST_LAG_S * SAMPLE_RATE)
-"""Samples of lag, either way; a running filter follows .1 s more."""
+"""Largest lag in samples, of either sign; a running filter follows lags up to .1 s longer."""
 LOOK = SAMPLE_RATE
 """Samples of the recording in one look: clocks 300 ppm apart move the lag by 5 of them meanwhile. Of 23 real recordings with an echo it
 is found in all; with looks of 2 s not in two whose lag changes faster, or whose microphone is processed."""
@@ -38,7 +38,7 @@ LOST = 1280
 class Belief:
     """What is believed of a recording's lag, look by look.
 
-    starts: (looks,), first sample of each second. lags: (looks,), the likeliest, samples by which the recording lags behind
+    starts: (looks,), first sample of each look, which is a second long. lags: (looks,), the likeliest, samples by which the recording lags behind
     the reference, below zero where that is late. probability: (looks,), of these lags against all others and none at all.
     late: (looks,), probability that the reference comes after its echo, by more than the filter waits for it. beyond: (looks,),
     probability that the lag is more than is followed. evidence: natural logarithm of the odds that the recording contains the

@@ -16,7 +16,7 @@ from edgefilter.types import SAMPLE_RATE, Samples
 NOBODY = BargeInSettings(threshold=1.0 - 1e-9)
 """Nobody else speaks, so whatever sounds human is the robot."""
 LEAST_S = 5.0
-"""Seconds of its voice from which its rate is known at all: one moment in them is eight times the usual rate."""
+"""Least seconds of the robot's voice from which the rate of false suspicions is told: one in 5 s is eight times the usual rate."""
 
 
 def calibrate_moving(

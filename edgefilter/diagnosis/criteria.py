@@ -18,11 +18,11 @@ class Criteria:
     false_rate: float = 0.01
     """Of ordinary recordings, the share in which an effect may be named by chance (diagnosis/ordinary.py)."""
 
-    # Shares of what there is to explain. Fifteen numbers for a question each named 78 recordings of one or two hidden effects
-    # no better than four did, and those four named 80 of up to three no better than these (voices of training and validation)
+    # Shares of what there is to explain. With fifteen numbers, one for each question, 78 recordings of one or two hidden effects were named
+    # no better than with four; with those four, 80 recordings of up to three effects no better than with these (training and validation voices)
     nearly: float = 0.85
-    """A simpler effect that explains this share of what a flexible one does is preferred: that takes up some of whatever is left.
-    One that explains this share of all there is may be the right one already, and no richer one is tried."""
+    """A simpler effect that explains this share of what a flexible one explains is preferred, since a flexible one fits a part of any residual.
+    An effect that explains the same share of everything may be the right one already: no richer one is tried."""
     half: float = 0.5
     """What all findings together explain at least of the excess, in level and in power: less is not what happened."""
     part: float = 0.2

@@ -36,7 +36,7 @@ def at_first_sight(recording: Straightened, criteria: Criteria) -> dict[str, flo
             found[effect.family] = max(found.get(effect.family, 0.0), gain_db)
     if (
         p_value("volume", found["volume"]) > criteria.false_rate
-    ):  # no effect's name: as rare as by the one that explains most
+    ):  # a volume is in no table: judged by the effect that explains most by chance
         del found["volume"]
     return dict(sorted(found.items(), key=lambda entry: -entry[1]))
 
@@ -47,7 +47,7 @@ def _is_response(effect: Effect) -> bool:
 
 
 def _loudest(recording: Straightened) -> Straightened:
-    """Of a recording the stretch that a gain is fitted to; in its first half second the echo of what came before is missing."""
+    """The stretch of a recording that a gain is fitted to, but for its first half second: the prediction lacks the echo of what was said before."""
     measurement = recording.measurement
     part = excerpt(measurement, recording.model, EXCERPT)
     usable = recording.usable[part].copy()

@@ -101,17 +101,17 @@ class Recording:
         return describe(self.straightened, self.straightened.model)
 
     def at_first_sight(self, criteria: Criteria | None = None) -> dict[str, float]:
-        """Say within a second or two which families of effects the profile lacks, and by how many dB each lowers what is left.
+        """Say after a second or two of computing which families of effects the profile lacks, and by how many dB each lowers the residual.
 
         Parameters
         ----------
         criteria : Criteria, optional
-            How rarely a family is told by chance.
+            `false_rate`: of recordings without any effect, the share in which a family may be told.
 
         Returns
         -------
         dict of str to float
-            The largest first; empty where none is seen. `diagnose` says what it is, also behind the first one.
+            The largest first; empty where none is seen. `diagnose` names the effects, those as well that a larger one hides.
         """
         return at_first_sight(self.straightened, criteria or Criteria())
 

@@ -43,7 +43,7 @@ class VoiceModel(Protocol):
 
     @property
     def as_filter(self) -> tuple[Samples, int] | None:
-        """The filter (taps,) that the model is and its lead; None where it is more than that."""
+        """The filter (taps,) that does what `predict` does, and the samples by which it leads; None where that is not linear or changes with time."""
 
     def predict(self, reference: Samples) -> Samples:
         """The robot's voice at the microphone (n,) for an aligned reference (n,)."""
@@ -86,7 +86,7 @@ class Measurement:
         return x if self._whitening is None else filtered(x, self._whitening, self._whitening.size // 2)
 
     def heard(self, model: VoiceModel, x: Samples) -> Samples:
-        """What a model makes of another reference x (m,), whitened, (m,): by one filter where it is one."""
+        """What a model predicts for another reference x (m,), whitened, (m,); by one filter where the model is a filter."""
         whole = self.once(_whitened, model)
         return self.whiten(model.predict(x)) if whole is None else filtered(x, *whole)
 
@@ -143,7 +143,7 @@ def whitening_taps(noise_psd: Samples) -> Samples:
 
 
 def _whitened(measurement: Measurement, model: VoiceModel) -> tuple[Samples, int] | None:
-    """The filter of a model and the whitening behind it as one, and its lead; None where the model is no filter."""
+    """One filter (taps,) for a model and the whitening of what it predicts, and the samples by which it leads; None where the model is no filter."""
     found, white = model.as_filter, measurement._whitening
     if found is None or white is None:
         return found

@@ -48,7 +48,7 @@ class EchoModel:
 
     @property
     def as_filter(self) -> tuple[Samples, int] | None:
-        """The filter (taps,) that predict() is and its lead in samples; None where an effect is more than that."""
+        """The filter (taps,) that does what predict() does, and the samples by which it leads; None where that is not linear or changes with time."""
         ahead, ((path, _), *later), lead, behind = self._chain
         return None if ahead or later or behind else (path, lead)
 

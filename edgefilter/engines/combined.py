@@ -86,7 +86,10 @@ class Fallback:
         )
 
     def _move(self, weight: float, *indices: int) -> float:
-        """The next weight of the voice that is coming in (indices: heard, coming), towards whichever of the two is nearer to what is wanted."""
+        """The next weight of the engine that fades in, nearer to the one of the two whose index is closer to `wanted`.
+
+        indices: of the engine that is heard, and of the one that fades in.
+        """
         goal = 1 if abs(self.wanted - indices[1]) < abs(self.wanted - indices[0]) else 0
         step = 1.0 / (DOWN if indices[goal] == max(indices) else UP)
         return min(weight + step, 1.0) if goal else max(weight - step, 0.0)

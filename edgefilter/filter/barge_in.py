@@ -110,12 +110,12 @@ class OwnVoice:
 
     @property
     def higher(self) -> float:
-        """Log-odds by which a human must be more likely than beside a usual robot, so that this one is suspected as rarely."""
+        """Further log-odds that a human needs beside this robot, so that it raises as few false suspicions as a usual robot."""
         return FALL * math.log((1.0 + self._peaks / self._usual) / (1.0 + self._hops / self._memory))
 
     @property
     def counted(self) -> tuple[float, float]:
-        """So many moments in so many seconds, both as far as they are remembered."""
+        """False suspicions that were counted, and the seconds of the robot's voice in which they came; both are forgotten alike."""
         return self._peaks, self._hops * self._hop_s
 
     def note(self, odds: float, open_: bool) -> None:

@@ -47,7 +47,7 @@ class WhileMoving(ProfilePart):
 
     @property
     def level_db(self) -> float:
-        """Power of what sounds with the voice, over that of the echo, dB."""
+        """Power of the noise that comes with the voice, over that of the echo, dB."""
         return float(decibels(max(total_power(self.density), 0.0), 1e-12))
 
     @classmethod
@@ -57,6 +57,6 @@ class WhileMoving(ProfilePart):
         return cls(density.astype(np.float32), moments, seconds)
 
     def with_voice(self, stft: StftConfig) -> Samples:
-        """Expected power in each bin of a frame of stft, over the whole power of the echo's frame, (bins,)."""
+        """Power of that noise expected in each bin of a frame of stft, divided by the sum of the echo's power over all bins, (bins,)."""
         density = np.interp(stft.frequencies, frequencies(GRID_BINS), self.density)
         return (density * stft.frequencies[1]).astype(np.float32)
