@@ -10,6 +10,7 @@ from edgefilter.cli import main
 
 ROOT = Path(__file__).parents[1]
 DEMO = ROOT / "edgefilter/demo_data"
+CALIBRATION = ROOT / "tests/data/demo_calibration"
 
 
 def here(*words):

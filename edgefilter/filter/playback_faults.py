@@ -93,7 +93,7 @@ def _harmonics(x: Samples) -> Samples:
 
 
 def _between(rows: Array, at: Array) -> Array:
-    """Rows (n, m) at fractional positions (k,), interpolated linearly, (k, m)."""
+    """Linear interpolation between rows (n, m) at fractional positions (k,), (k, m)."""
     whole = np.minimum(at.astype(int), rows.shape[0] - 2)
     part = (at - whole).astype(np.float32)[:, None]
     return (1.0 - part) * rows[whole] + part * rows[whole + 1]

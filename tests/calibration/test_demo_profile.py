@@ -8,13 +8,12 @@ import soundfile
 
 import edgefilter
 from edgefilter import Profile, calibrate
-
-RECORDINGS = Path(__file__).parents[1] / "data/demo_calibration"
+from tests.program import CALIBRATION
 
 
 def test_the_bundled_profile_is_what_calibration_makes_of_its_recordings():
     names = ("sweep_reference", "sweep_recording", "fan")
-    made = calibrate(*(soundfile.read(RECORDINGS / f"{name}.flac", dtype="float32")[0] for name in names))
+    made = calibrate(*(soundfile.read(CALIBRATION / f"{name}.flac", dtype="float32")[0] for name in names))
     kept = Profile.load(Path(edgefilter.__file__).parent / "demo_data/profile.npz")
     assert made.delay == kept.delay and made.warnings == kept.warnings
     path = kept.echo.impulse_response

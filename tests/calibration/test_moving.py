@@ -18,8 +18,7 @@ from edgefilter.filter.barge_in import OwnVoice
 from edgefilter.filter.residual_echo import Residual
 from edgefilter.profile.data import GRID_HZ
 from edgefilter.profile.while_moving import WhileMoving
-from tests.calibration.test_demo_profile import RECORDINGS
-from tests.program import DEMO
+from tests.program import CALIBRATION, DEMO
 
 STFT = StftConfig()
 RATE, MOTORS_HZ, MOTORS_DB = 16_000, 2000.0, -12.0
@@ -103,7 +102,7 @@ def test_the_command_takes_the_recording_of_a_moving_robot(tmp_path, monkeypatch
         ("--sweep-recording", "sweep_recording"),
         ("--noise-recording", "fan"),
     ]
-    words = ["calibrate", *(word for option, name in files for word in (option, str(RECORDINGS / f"{name}.flac")))]
+    words = ["calibrate", *(word for option, name in files for word in (option, str(CALIBRATION / f"{name}.flac")))]
     words += ["--output", "robot.npz", "--json", "robot.json", "--while-moving"]
     assert cli.main([*words, "mic.wav", str(DEMO / "reference.flac")]) == 0
     told = json.loads((tmp_path / "robot.json").read_text())["while_moving"]
