@@ -64,16 +64,22 @@ def aec3_frames() -> Callable[[Samples, Samples], object]:
     return EchoCanceller(sample_rate=SAMPLE_RATE).process
 
 
-def echoff(mic: Samples, ref: Samples) -> Samples:
-    """Echoff 0.3, LiveKit's WebRTC processing at 48 kHz with echoff's settings, (n,) float32 for mic and ref (n,), aligned."""
+def echoff_processor() -> type:
+    """Its canceller, not made yet: LiveKit's runtime must not begin in a process that forks others."""
     try:
         from echoff import WebRtcAecProcessor
     except ImportError as error:
         raise UsageError("echoff is missing: pip install echoff (Python 3.11 or newer)") from error
+    return WebRtcAecProcessor
+
+
+def echoff(mic: Samples, ref: Samples) -> Samples:
+    """Echoff 0.3, LiveKit's WebRTC processing at 48 kHz with echoff's settings, (n,) float32 for mic and ref (n,), aligned."""
+    canceller = echoff_processor()()
     mic, ref = as_samples(mic, "mic"), as_samples(ref, "ref")
     padding = (0, -(-(mic.size + ECHOFF_DELAY) // AEC3_FRAME) * AEC3_FRAME - mic.size)
     far, near = (resample_poly(np.pad(x, padding), ECHOFF_TIMES, 1).tolist() for x in (ref, mic))
-    out = resample_poly(np.array(WebRtcAecProcessor().process_pair(far, near)), 1, ECHOFF_TIMES)
+    out = resample_poly(np.array(canceller.process_pair(far, near)), 1, ECHOFF_TIMES)
     return out[ECHOFF_DELAY : ECHOFF_DELAY + mic.size].astype(np.float32)
 
 

@@ -357,7 +357,8 @@ def _peers() -> list[System]:
     found = []
     for (name, title), samples in zip(PEERS.items(), late, strict=True):
         process = getattr(peers, name.replace("-", "_"))
-        probe = partial(process, *np.zeros((2, SAMPLE_RATE // 10), np.float32))
+        tried = partial(process, *np.zeros((2, SAMPLE_RATE // 10), np.float32))
+        probe = peers.echoff_processor if name == "echoff" else tried
         for ending, told in (("", ""), (TRUE_LAG, ", told the true lag")):
 
             def run(clip: Clip, process: Callable = process, lagged: bool = bool(ending)) -> Output:
