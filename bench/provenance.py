@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -45,6 +46,10 @@ def stamp(
     data, systems = dict(data or {}), list(systems)
     files = models_of(systems) | {name: path for name, path in (models or {}).items() if path is not None}
     commit, dirty = results.revision()
+    with ProcessPoolExecutor(
+        1
+    ) as apart:  # a runtime that begins here, such as LiveKit's, could not be used by workers that are forked
+        judged = apart.submit(behaviour, systems).result()
     return {
         "command": command(data, files),
         "commit": commit,
@@ -53,7 +58,7 @@ def stamp(
             {"what": w, "folder": p.resolve().name, **results.digest(p)} for w, paths in data.items() for p in paths
         ],
         "models": {name: results.digest(path) for name, path in files.items()},
-        "judged": behaviour(systems),
+        "judged": judged,
         "machine": results.machine(),
         "date": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
     }
