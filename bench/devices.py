@@ -143,7 +143,9 @@ def at_a_glance(rows: Sequence[dict], able: Sequence[System]) -> dict:
         row, _, detector = name.partition("+")
         laid, alone = (of(rows, row, part) for part in ("laid", "alone"))
         told, heard = (of(rows, name, part) for part in ("alone", "laid"))
-        cells.append([systems.catalogue()[row].title, mean(per_device(alone, "erle_db"), "erle_db"),
+        through = systems.catalogue()[row]
+        title = f"edgefilter: {through.title}" if through.kind == "own" else through.title
+        cells.append([title, mean(per_device(alone, "erle_db"), "erle_db"),
                       mean(per_device(laid, "si_sdr"), "si_sdr"), mean(per_device(laid, "capped"), "capped"),
                       DETECTORS[detector].title if detector else "edgefilter", starts(told), soon(heard)])  # fmt: skip
     columns = ["the microphone through", ("robot alone, lowered by dB", 0), ("human, SI-SDR in dB", 1), ("words wrong, %", 0),
