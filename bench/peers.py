@@ -25,7 +25,8 @@ AEC3_DELAY = 128
 """Samples by which AEC3 delays the signal (it regroups frames of 80 samples into blocks of 64); removed here."""
 ECHOFF_TIMES, ECHOFF_DELAY = 3, 143
 """By which its rate is ours, and samples at our rate by which it delays the signal; removed here."""
-VOICECLEAN_FRAME = 320
+VOICECLEAN_FRAME = 640
+"""Samples that it takes at a time, 40 ms."""
 
 
 def speexdsp(mic: Samples, ref: Samples, suppress: bool = False) -> Samples:
@@ -84,7 +85,7 @@ def echoff(mic: Samples, ref: Samples) -> Samples:
 
 
 def voiceclean(mic: Samples, ref: Samples) -> Samples:
-    """Voiceclean 0.3's echo canceller, (n,) float32 for mic and ref (n,): chunks of 20 ms that correlate with what was played are masked."""
+    """Voiceclean 0.3's echo canceller, (n,) float32 for mic and ref (n,): chunks of 40 ms that correlate with what was played are masked."""
     try:
         from voiceclean.aec import AEC
     except ImportError as error:
