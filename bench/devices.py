@@ -138,13 +138,12 @@ def overview(name: str, title: str, rows: Sequence[dict], here: Sequence[System]
 
 def at_a_glance(rows: Sequence[dict], able: Sequence[System]) -> dict:
     """The rows of GLANCE: what is left of the robot, what of the human, and how often the robot would stop because of itself."""
-    known, cells = {one.name: one for one in able}, []
-    for name in (name for name in GLANCE if name in known):
+    known, cells, here = systems.catalogue(), [], {one.name for one in able}
+    for name in (name for name in GLANCE if name in here):
         row, _, detector = name.partition("+")
         laid, alone = (of(rows, row, part) for part in ("laid", "alone"))
         told, heard = (of(rows, name, part) for part in ("alone", "laid"))
-        through = systems.catalogue()[row]
-        title = f"edgefilter: {through.title}" if through.kind == "own" else through.title
+        title = f"edgefilter: {known[row].title}" if known[row].kind == "own" else known[row].title
         cells.append([title, mean(per_device(alone, "erle_db"), "erle_db"),
                       mean(per_device(laid, "si_sdr"), "si_sdr"), mean(per_device(laid, "capped"), "capped"),
                       DETECTORS[detector].title if detector else "edgefilter", starts(told), soon(heard)])  # fmt: skip

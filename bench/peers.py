@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 from scipy.signal import resample_poly
 
+from edgefilter.audio.raw import of_pcm16, to_pcm16
 from edgefilter.errors import UsageError
 from edgefilter.types import SAMPLE_RATE, Samples, as_samples
 
@@ -38,7 +39,7 @@ def speexdsp(mic: Samples, ref: Samples, suppress: bool = False) -> Samples:
     mic, ref = as_samples(mic, "mic"), as_samples(ref, "ref")
     delay = SUPPRESSED_DELAY if suppress else 0
     padding = (0, -(-(mic.size + delay) // FRAME) * FRAME - mic.size)
-    near, far = (_int16(np.pad(x, padding)) for x in (mic, ref))
+    near, far = (to_pcm16(np.pad(x, padding))[0] for x in (mic, ref))
     out = np.zeros_like(near)
     with speexdsp_frames(suppress) as step:
         for at in range(0, near.size, FRAME):
@@ -92,15 +93,11 @@ def voiceclean(mic: Samples, ref: Samples) -> Samples:
         raise UsageError("voiceclean is missing: pip install voiceclean") from error
     mic, ref = as_samples(mic, "mic"), as_samples(ref, "ref")
     padding, canceller, out = (0, -mic.size % VOICECLEAN_FRAME), AEC(sample_rate=SAMPLE_RATE), b""
-    frames = (_int16(np.pad(x, padding)).reshape(-1, VOICECLEAN_FRAME) for x in (mic, ref))
+    frames = (to_pcm16(np.pad(x, padding))[0].reshape(-1, VOICECLEAN_FRAME) for x in (mic, ref))
     for near, far in zip(*frames, strict=True):
         canceller.feed_reference(far.tobytes())
         out += canceller.process(near.tobytes())
-    return np.frombuffer(out, np.int16)[: mic.size].astype(np.float32) / 32768.0
-
-
-def _int16(x: Samples) -> np.ndarray:
-    return np.rint(np.clip(x * 32768.0, -32768, 32767)).astype(np.int16)
+    return of_pcm16(out, 1)[: mic.size, 0]
 
 
 @contextmanager

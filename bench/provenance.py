@@ -46,9 +46,8 @@ def stamp(
     data, systems = dict(data or {}), list(systems)
     files = models_of(systems) | {name: path for name, path in (models or {}).items() if path is not None}
     commit, dirty = results.revision()
-    with ProcessPoolExecutor(
-        1
-    ) as apart:  # a runtime that begins here, such as LiveKit's, could not be used by workers that are forked
+    # a runtime that begins here, such as LiveKit's, could not be used by workers that are forked
+    with ProcessPoolExecutor(1) as apart:
         judged = apart.submit(behaviour, systems).result()
     return {
         "command": command(data, files),

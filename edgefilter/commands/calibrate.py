@@ -121,9 +121,8 @@ def _record(args: argparse.Namespace, folder: Path) -> tuple[Samples, Samples, S
 def _record_moving(args: argparse.Namespace, folder: Path) -> tuple[Samples, Samples]:
     """What the microphone hears while a voice is played and the robot moves, and that voice."""
     voice = read(str(DEMO / "reference.flac"), "voice")
-    peak = (
-        10 ** (args.level_db / 20) / SWEEP_PART
-    )  # as loud as the multisines, whose loud moments are as those of speech
+    # as loud as the multisines, whose loud moments are as those of speech
+    peak = 10 ** (args.level_db / 20) / SWEEP_PART
     voice *= min(1.0, peak) / np.abs(voice).max()
     recorded, said = (folder / f"{name}.wav" for name in MOVING)
     write_file(said, voice, float32=True)

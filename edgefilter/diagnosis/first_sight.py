@@ -34,9 +34,8 @@ def at_first_sight(recording: Straightened, criteria: Criteria) -> dict[str, flo
         gain_db = min(before, turned) - part.of(part.model.with_effect(effect.name, values)).level_db
         if p_value(effect.name, gain_db) <= criteria.false_rate:
             found[effect.family] = max(found.get(effect.family, 0.0), gain_db)
-    if (
-        p_value("volume", found["volume"]) > criteria.false_rate
-    ):  # a volume is in no table: judged by the effect that explains most by chance
+    # a volume is in no table: judged by the effect that explains most by chance
+    if p_value("volume", found["volume"]) > criteria.false_rate:
         del found["volume"]
     return dict(sorted(found.items(), key=lambda entry: -entry[1]))
 
