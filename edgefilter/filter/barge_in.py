@@ -200,6 +200,7 @@ class BargeIn:
         """Take the probability of a hop, None where the engine does not judge it.
 
         wait: hops for which speech that has begun is not told yet, nor suspected; if it has ended by then it never is.
+        Where that is over before its time, the robot is found: the sum then begins anew, as where the robot has lowered its voice.
         heard_after: hops after which a voice that is lowered now would be heard lower; 0 where it cannot be lowered.
         robot: whether the robot's voice is heard, so that the hop teaches how often it is taken for a human.
         """
@@ -219,6 +220,8 @@ class BargeIn:
                 return None
         if not self._hops and heard_after <= self._longest:
             self._asked = heard_after
+        if self._certain and not self._told and not wait:
+            self._asked, self._certain = self._hops, False
         self._hops += 1
         if self._silent >= self._pause or not self._holds(probability):
             return self.end()

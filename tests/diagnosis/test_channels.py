@@ -13,7 +13,7 @@ from edgefilter import Profile, ProfileError, SignalError
 from edgefilter.diagnosis.channels import doubtful_channels, is_clipped
 from edgefilter.types import SAMPLE_RATE
 from tests.filter.array_scene import PATHS, calibration, fan, noise, talk
-from tests.program import edgefilter, one_line
+from tests.program import here, one_line
 
 
 @pytest.fixture
@@ -92,7 +92,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def diagnose(folder: Path, *more: object):
     recording = ("--recording", folder / "five.wav", "--reference", folder / "said.wav")
-    return edgefilter("diagnose", *recording, "--profile", folder / "three.npz", *more)
+    return here("diagnose", *recording, "--profile", folder / "three.npz", *more)
 
 
 @pytest.mark.slow

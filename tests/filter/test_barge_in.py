@@ -391,3 +391,13 @@ def test_how_long_a_beginning_was_not_told_is_known_when_it_is():
     assert [talk.note(0.9999, wait=3) for _ in range(4)][-1] == "speech_started" and talk.waited == 3
     talk.end()
     assert [talk.note(0.9999) for _ in range(2)][-1] == "speech_started" and talk.waited == 1
+
+
+def test_what_had_to_wait_is_tested_on_what_follows():
+    """Sound that is found to be the robot's as soon as the lag is known, which also ends the waiting."""
+    talk = BargeIn(0.016)
+    assert not any(talk.note(0.9999, wait=30) for _ in range(20))
+    told = [talk.note(0.0) for _ in range(30)]
+    assert [each for each in told if each] == ["speech_suspected", "speech_dismissed"] and not talk.speaking
+    assert not any(talk.note(0.9999, wait=30) for _ in range(20))
+    assert [talk.note(each) for each in (0.0, 0.9999)] == ["speech_suspected", "speech_started"]
