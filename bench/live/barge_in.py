@@ -10,7 +10,7 @@ sound. The recogniser gets the human's span of what each of them leaves.
 Backchannels: the same scenes, with a short word or a cough in the place of the interruption. False stops: the robot
 alone for --minutes of its speech (--alone: its voices), in new rooms all the time, half of them with loudspeakers of
 strong distortion and half without a calibration, and recordings of a real loudspeaker (--real) that nothing was tuned
-on. --ask-db: interruptions and false stops with a robot that lowers its voice where the filter asks for it; --sound: what
+on, lowered as a whole where the robot asks. --ask-db: interruptions and false stops with a robot that lowers its voice where the filter asks for it; --sound: what
 each of them plays that is interrupted and calibrated, on the left, and what its microphone hears. Rows are kept in --cache
 as they are made: a run that was cut off, or is asked for more minutes, goes on there.
 """
@@ -274,8 +274,8 @@ def monologue(made: Monologue, engine: str, ask_db: float) -> dict:
     return of | {"said": said} | stops(talk, sum(seconds for _, seconds in said))
 
 
-def real_minutes(folder: Path, engine: str) -> list[dict]:
-    """A row for each recording of a robot alone that nothing was tuned on."""
+def real_minutes(folder: Path, engine: str, ask_db: float) -> list[dict]:
+    """A row for each recording of a robot alone that nothing was tuned on; where it asks, all that is recorded falls."""
     rows = []
     for recording in progress([r for r in find_recordings(folder) if r.kind == "farend" and not r.tuned_on]):
         signals = recording.signals()
@@ -284,8 +284,18 @@ def real_minutes(folder: Path, engine: str) -> list[dict]:
         speech_s = float(np.sum(power > AUDIBLE * power.max()))
         row = {"room": "real", "distortion": "real", "start": "cold", "voice": "real-recorded"}
         row["said"] = [[recording.name, speech_s]]
-        rows.append(row | stops(listen(signals.mic, signals.ref, None, engine), speech_s))
+        robot = recorded(signals.mic, signals.ref, ask_db) if ask_db else None
+        rows.append(row | stops(listen(signals.mic, signals.ref, None, engine, robot), speech_s))
     return rows
+
+
+def recorded(mic: Samples, ref: Samples, ask_db: float) -> Robot | None:
+    """A recorded robot, as late as the filter finds it in the end; None where it is not found."""
+    ego = EgoFilter(engine="linear")
+    ego.process(mic, ref)
+    found = ego.stats()["alignment"]
+    late = found["delay_samples"] if found else None
+    return None if late is None else Robot(mic, round(late), ask_db)
 
 
 def stops(talk: Output, speech_s: float) -> dict:
@@ -330,14 +340,14 @@ def run(options: argparse.Namespace) -> str:
 
         rows.append(kept.get(made, of, "conversation", index))
     alone = monologues(options.alone, options.minutes, options.seed, engine, options.ask_db, kept, of)
-    alone += real_minutes(options.real, engine) if options.real else []
+    alone += real_minutes(options.real, engine, options.ask_db) if options.real else []
     points = {start: curve([row[start] for row in rows], alone, start) for start in STARTS}
     lines = {start: ([p["per_hour"] for p in of], [100 * p["in_time"] for p in of]) for start, of in points.items()}
     panel = results.panel(f"threshold {THRESHOLDS[0]} to {THRESHOLDS[-1]}", "false stops an hour of robot speech",
                           f"noticed within {IN_TIME_S} s, %", lines, "o-", ylim=(0, 102))  # fmt: skip
     notes = f"Engine `{engine}`, default threshold. Humans 20-28 dB below the robot that talks meanwhile."
     if options.ask_db:
-        notes += f" The robot asks: it lowers its voice by {options.ask_db:g} dB, the real recordings apart."
+        notes += f" The robot asks: it lowers its voice by {options.ask_db:g} dB, and a recorded one all that its recording holds."
     return results.write(
         options.output, "barge_in", "Barge-in in closed loop", made_with, tables(rows, alone, points),
         [results.plot("barge_in", [panel])], notes, engine=engine, conversations=rows, alone=alone, curve=points,

@@ -22,6 +22,7 @@ from bench.simulate.simulated_robot import Room, draw_robot, draw_walls, stand
 from bench.systems import Output
 from edgefilter import Event
 from tests.bench.conftest import RATE, babble
+from tests.program import DEMO
 
 
 def run(output: Path, part: str, *arguments: object) -> tuple[dict, str]:
@@ -269,6 +270,13 @@ def test_speech_lasts_until_a_pause_of_a_fifth_of_a_second() -> None:
     assert lasts(talk((1.0, 0.1), (0.2, 1.0), (1.0, 0.1)), RATE) == [True, False, False, False]
     assert lasts(talk((1.0, 0.1), (2.0, 1.0)), RATE) == [True] * 4
     assert lasts(talk((1.0, 0.1), (0.2, 1.0), (0.1, 0.1), (0.6, 1.0), (1.0, 0.1)), RATE) == [True, True, True, True]
+
+
+def test_a_recorded_robot_is_lowered_as_late_as_it_is_found() -> None:
+    mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0][: 7 * RATE] for name in ("mic", "reference"))
+    robot = barge_in.recorded(mic, ref, 12.0)
+    assert robot is not None and robot.late == pytest.approx(2288, abs=48) and robot.ask_db == 12.0
+    assert barge_in.recorded(mic[::-1].copy(), ref, 12.0) is None
 
 
 @pytest.mark.slow
