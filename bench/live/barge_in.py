@@ -10,9 +10,10 @@ sound. The recogniser gets the human's span of what each of them leaves.
 Backchannels: the same scenes, with a short word or a cough in the place of the interruption. False stops: the robot
 alone for --minutes of its speech (--alone: its voices), in new rooms all the time, half of them with loudspeakers of
 strong distortion and half without a calibration, and recordings of a real loudspeaker (--real) that nothing was tuned
-on, lowered as a whole where the robot asks. --ask-db: interruptions and false stops with a robot that lowers its voice where the filter asks for it; --sound: what
-each of them plays that is interrupted and calibrated, on the left, and what its microphone hears. Rows are kept in --cache
-as they are made: a run that was cut off, or is asked for more minutes, goes on there.
+on, lowered as a whole where the robot asks. --ask-db: interruptions and false stops with a robot that lowers its voice
+where the filter asks for it; --sound: what each of them plays that is interrupted and calibrated, on the left, and what
+its microphone hears. Rows are kept in --cache as they are made: a run that was cut off, or is asked for more minutes,
+goes on there.
 """
 
 from __future__ import annotations
