@@ -27,7 +27,7 @@ STEADY_DB = 1.5
 its own spectrum (the loud and the quiet tenth of three real ones by 0.9 to 1.0, of a running tap by 1.2; of a talker, or of
 something that slams, by more)."""
 REMEMBERED = 6
-"""Models whose predictions a measurement keeps: one that a search goes on from, and some beside it."""
+"""Models of which a measurement keeps what was worked out: one that a search goes on from, and some beside it."""
 
 
 class VoiceModel(Protocol):
@@ -73,8 +73,7 @@ class Measurement:
     noise_psd: Samples | None = None
     fit: NDArray[np.bool_] | None = None
     calibrated_psd: Samples | None = None
-    _predicted: dict[VoiceModel, tuple[Samples, Samples]] = field(default_factory=dict, init=False, repr=False)
-    _done: dict[tuple[object, VoiceModel], Any] = field(default_factory=dict, init=False, repr=False)
+    _done: dict[VoiceModel, dict[object, Any]] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def weights(self) -> Samples:
@@ -107,21 +106,16 @@ class Measurement:
 
     def predicted(self, model: VoiceModel) -> tuple[Samples, Samples]:
         """What a model predicts for the reference, and that whitened, (n,) each; remembered, not to be written to."""
-        known = self._predicted.pop(model, None)
-        if known is None:
-            predicted = model.predict(self.reference)
-            known = predicted, self.whiten(predicted)
-            while len(self._predicted) >= REMEMBERED:
-                del self._predicted[next(iter(self._predicted))]
-        self._predicted[model] = known
-        return known
+        return self.once(_predicted, model)
 
     def once(self, work: Callable[[Measurement, VoiceModel], Result], model: VoiceModel) -> Result:
-        """What work makes of this measurement and a model, remembered: for a fit that several effects share."""
-        key = work, model
-        if key not in self._done:
-            self._done[key] = work(self, model)
-        return self._done[key]
+        """What work makes of this measurement and a model, remembered of the latest models: what several fits share."""
+        done = self._done[model] = self._done.pop(model, {})
+        while len(self._done) > REMEMBERED:
+            del self._done[next(iter(self._done))]
+        if work not in done:
+            done[work] = work(self, model)
+        return done[work]
 
     def error(self, predicted: Samples) -> float:
         """Weighted sum of squares of the whitened recording minus predicted (n,): what a fit makes small."""
@@ -140,6 +134,11 @@ def whitening_taps(noise_psd: Samples) -> Samples:
     taps = np.fft.fftshift(np.fft.irfft(1.0 / np.sqrt(floored(noise_psd) * SAMPLE_RATE / 2)))[1:]
     taps *= np.hanning(taps.size + 2)[1:-1] ** 0.25
     return taps.astype(np.float32)
+
+
+def _predicted(measurement: Measurement, model: VoiceModel) -> tuple[Samples, Samples]:
+    predicted = model.predict(measurement.reference)
+    return predicted, measurement.whiten(predicted)
 
 
 def _whitened(measurement: Measurement, model: VoiceModel) -> tuple[Samples, int] | None:

@@ -10,7 +10,7 @@ from scipy import fft
 
 from edgefilter.dsp.convolution import filtered
 from edgefilter.dsp.fourier import power as power_of
-from edgefilter.echo.measurement import Measurement
+from edgefilter.echo.measurement import Measurement, VoiceModel
 from edgefilter.echo.recording import BLOCK
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
@@ -23,14 +23,21 @@ LONGEST = 12800
 
 
 def fit_filter(
-    x: Samples, target: Samples, weights: Samples, taps: int, lead: int, prior: Array | None = None, steps: int = 12
+    x: Samples,
+    target: Samples,
+    weights: Samples,
+    taps: int,
+    lead: int,
+    prior: Array | None = None,
+    steps: int = 12,
+    start: Array | None = None,
 ) -> Array:
     """The filter c that minimises sum w(n) (target(n) - sum_k c[k] x(n - k + lead))^2 + sum c^2 / prior, (taps,) float64.
 
     x, target: (n,), whitened, so that the noise has variance 1. weights: (n,) 0 to 1. prior: (taps,) expected c^2;
-    None: no penalty but a tiny one. Preconditioned conjugate gradients on the normal equations (Golub & Van Loan,
-    Matrix Computations, 11.5) with a circulant preconditioner; stopping after `steps` leaves out what the data hardly
-    speaks of. Not scipy's cg, whose iterates do not tell what a step explains: float32 drowns the difference.
+    None: no penalty but a tiny one. start: (taps,), what is known of it; None: nothing. Preconditioned conjugate gradients on
+    the normal equations (Golub & Van Loan, Matrix Computations, 11.5) with a circulant preconditioner; stopping after `steps`
+    leaves out what the data hardly speaks of. Not scipy's cg, whose iterates do not tell what a step explains: float32 drowns the difference.
     """
     blocks = _Blocks(x, weights, taps, lead)
     share = float(np.mean(weights))
@@ -43,8 +50,9 @@ def fit_filter(
     def condition(v: Array) -> Array:
         return scale * fft.irfft(fft.rfft(scale * v, size) / (power + lightest), size)[:taps]
 
-    c = np.zeros(taps)
-    left = blocks.adjoint(target)
+    c, left = np.zeros(taps), blocks.adjoint(target)
+    if start is not None:
+        c, left = start.copy(), left - blocks.normal(start) - penalty * start
     turned = condition(left)
     direction, energy = turned.copy(), float(np.dot(left, turned))
     first, explained = energy, 0.0
@@ -131,16 +139,24 @@ class Spectra:
     averaged: int
 
 
-def spectra(measurement: Measurement, white: Samples, resolution_hz: float) -> Spectra:
-    """Auto- and cross-spectra of a whitened prediction (n,) and the recording over the fit samples, averaged to resolution_hz."""
-    p = white * measurement.weights
-    y = measurement.white_recording * measurement.weights
-    n = fft.next_fast_len(p.size, real=True)
-    a, b = fft.rfft(p.astype(np.float64), n), fft.rfft(y.astype(np.float64), n)
+def spectra(measurement: Measurement, model: VoiceModel, resolution_hz: float) -> Spectra:
+    """Auto- and cross-spectra of a model's whitened prediction and the recording over the fit samples, averaged to resolution_hz."""
+    n = _transformed(measurement.recording.size)
+    whole = measurement.once(_spectra, model)
     width = max(int(resolution_hz * n / SAMPLE_RATE), 1)
-    count = a.size // width
-    auto, cross, own = (
-        2.0 / n * x[: count * width].reshape(count, width).sum(axis=1) for x in (power_of(a), b * a.conj(), power_of(b))
-    )
+    count = whole[0].size // width
+    auto, cross, own = (2.0 / n * x[: count * width].reshape(count, width).sum(axis=1) for x in whole)
     hz = (np.arange(count) + 0.5) * width * SAMPLE_RATE / n - 0.5 * SAMPLE_RATE / n
     return Spectra(hz, auto, cross, own, 2.0 * width / n * float(np.sum(measurement.weights)), width)
+
+
+def _transformed(size: int) -> int:
+    return fft.next_fast_len(size, real=True)
+
+
+def _spectra(measurement: Measurement, model: VoiceModel) -> tuple[Array, NDArray[np.complex128], Array]:
+    """Power of the prediction, cross-spectrum, and power of the recording in each bin, of the whitened fit samples."""
+    signals = measurement.predicted(model)[1], measurement.white_recording
+    n = _transformed(signals[0].size)
+    a, b = (fft.rfft((x * measurement.weights).astype(np.float64), n) for x in signals)
+    return power_of(a), b * a.conj(), power_of(b)

@@ -182,7 +182,7 @@ def test_a_band_edge_is_not_seen_where_the_volume_was_turned() -> None:
     edges = []
     for heard in (turned, cut):
         prepared = prepare(profile(), (heard + fan()).astype(np.float32), x)
-        edges.append(band_edge(spectra(prepared.measurement, prepared.measurement.predicted(prepared.model)[1], 20.0)))
+        edges.append(band_edge(spectra(prepared.measurement, prepared.model, 20.0)))
     assert edges == [None, pytest.approx(4000.0, rel=0.05)]
 
 

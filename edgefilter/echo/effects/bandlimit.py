@@ -93,7 +93,7 @@ class Bandlimit(Effect):
         taps rather than by its law, or with something above it that no filter passes.
         """
         predicted, x = measurement.predicted(model)
-        found = spectra(measurement, x, 20.0)
+        found = spectra(measurement, model, 20.0)
         turned = found.cross[:, None] * np.exp(2j * np.pi * np.outer(found.hz, DELAYS) / SAMPLE_RATE)
         turned = np.concatenate((turned.real, turned.imag))
 
@@ -116,22 +116,25 @@ class Bandlimit(Effect):
             )
             best, late = best_of(near, np.stack([low_pass(found.hz, *values) for values in near]))
             step = 1.0 + (step - 1.0) * 0.6
+        like_one = best[0] < HIGHEST_HZ and best[1] >= LEAST_ORDER
+        noisy = bool(model.unpredictable(measurement.reference))  # then what is heard there may be that
+        edge = None if noisy else band_edge(found)
+        if not like_one and edge is None:
+            return neutral(self)
         values: Values = {"cutoff_hz": best[0], "order": best[1], "phase": best[2], "delay": late}
         heard, plain = measurement.white_recording, self.apply(x, {**values, "taps": 0.0}, SAMPLE_RATE)
         taps = fit_filter(x, heard - plain, measurement.weights, TAPS, LEAD, prior=np.full(TAPS, 1e-3), steps=15)
         passed = plain + filtered(x, taps, LEAD)
         values = {**values, "taps": np.clip(taps, -10.0, 10.0)}
-        noisy = bool(model.unpredictable(measurement.reference))  # then what is heard there may be that
         if not noisy and not _dull_above(best[0], measurement, x, passed):
-            if (edge := band_edge(found)) is None:
+            if edge is None:
                 return neutral(self)
             values = complete(self, {"cutoff_hz": edge, "order": STEEP})
             dull = edge < HIGHEST_HZ and _dull_above(edge, measurement, x, self.apply(x, values, SAMPLE_RATE))
             return values if dull else neutral(self)
         gain = np.float32(level_ratio(heard, plain * measurement.weights))
         before, by_law, whole = (_level_db(measurement, heard - voice) for voice in (x, gain * plain, passed))
-        steep = best[0] < HIGHEST_HZ and best[1] >= LEAST_ORDER and before - by_law > BY_LAW * (before - whole)
-        return values if steep else neutral(self)
+        return values if like_one and before - by_law > BY_LAW * (before - whole) else neutral(self)
 
     def sentence(self, values: Values) -> str:
         """From where on there is nothing."""

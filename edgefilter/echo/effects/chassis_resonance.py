@@ -57,7 +57,7 @@ class ChassisResonance(Effect):
         Neutral where what is found is too broad for a mode, or cut off by the search's bounds.
         """
         predicted, white = measurement.predicted(model)
-        coarse, fine = (spectra(measurement, white, resolution_hz) for resolution_hz in (1.0, 0.1))
+        coarse, fine = (spectra(measurement, model, resolution_hz) for resolution_hz in (1.0, 0.1))
         residual = measurement.white_recording - white
         modes: list[tuple[float, float]] = []
         columns, gains, explained = np.zeros((white.size, 0), np.float32), np.zeros(0), 0.0

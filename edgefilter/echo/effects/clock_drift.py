@@ -44,16 +44,21 @@ class ClockDrift(Effect):
     )
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        ppm, offset, n = float(values["ppm"]), float(values["offset"]), np.arange(x.size)
-        return interpolate(x, n - offset + 1e-6 * ppm * n) if ppm or offset else x.copy()
+        still = not float(values["ppm"]) and not float(values["offset"])
+        return x.copy() if still else interpolate(x, self.read_at(values, x.size, sample_rate))
+
+    def read_at(self, values: Values, size: int, sample_rate: int) -> Array:
+        n = np.arange(size)
+        return n - float(values["offset"]) + 1e-6 * float(values["ppm"]) * n
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """A robust line through the lags of all blocks, then once more on the prediction that it has straightened; neutral for one clock."""
-        predicted, recording = measurement.predicted(model)[0], measurement.white_recording
+        (predicted, straight), recording = measurement.predicted(model), measurement.white_recording
         n = np.arange(predicted.size)
         lag: Array = np.zeros(predicted.size)
         for size, reach in PASSES:
-            straight = measurement.whiten(interpolate(predicted, n - lag))
+            if lag.any():
+                straight = measurement.whiten(interpolate(predicted, n - lag))
             track = track_lag(straight, recording, measurement.fit, size, reach)
             if track.lag.size < 3:
                 break

@@ -64,7 +64,7 @@ class Equaliser(Effect):
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Levenberg-Marquardt in the gains of all knots and the delay, in the whitened cross-spectrum; then taps. Neutral for a turned volume."""
         x = measurement.predicted(model)[1]
-        found = spectra(measurement, x, SAMPLE_RATE / FFT)
+        found = spectra(measurement, model, SAMPLE_RATE / FFT)
         knots, delay = _smooth_gain(found)
         gain_db = np.clip(knots * (20.0 / np.log(10.0)), -MOST_DB, MOST_DB)
         if float(np.std(gain_db)) < ORDINARY_DB:

@@ -74,14 +74,15 @@ class FanNoise(Effect):
         heard, was, start = residual[silent], floored(known), 0
         quiet = residual[whole] if whole.any() else residual
         found = heard.mean(axis=0) if len(heard) >= FEWEST_FRAMES else _quiet_mean(quiet)
-        if len(heard) and _swings(heard, found):
-            start = _turn(heard, was)
-            if not start or abs(np.median(_levels_db(heard[:start], was))) > STEADY_DB:
+        if len(heard):
+            if _swings(heard, found):
+                start = _turn(heard, was)
+                if not start or abs(np.median(_levels_db(heard[:start], was))) > STEADY_DB:
+                    return neutral(self)
+                heard, found = heard[start:], heard[start:].mean(axis=0)
+            now = floored(found)
+            if _swings(heard, found) or np.mean(np.log(now / was) + heard / now - heard / was) > 0.0:
                 return neutral(self)
-            heard, found = heard[start:], heard[start:].mean(axis=0)
-        now = floored(found)
-        if len(heard) and (_swings(heard, found) or np.mean(np.log(now / was) + heard / now - heard / was) > 0.0):
-            return neutral(self)
         from_s = float(np.flatnonzero(silent)[start] * size / 2 / SAMPLE_RATE) if start else 0.0
         floor = floored(known if measurement.calibrated_psd is None else measurement.calibrated_psd)
         smooth = np.convolve(np.pad(found / floor, 1, mode="edge"), SMOOTH, "valid")

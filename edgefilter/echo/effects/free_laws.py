@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -13,7 +14,7 @@ from scipy.ndimage import map_coordinates
 from edgefilter.dsp.convolution import filtered
 from edgefilter.dsp.frames import block_power, block_sums, blocks, decibels
 from edgefilter.echo.effect import Effect, Parameter, Runner, Stage, first, neutral, numbers, vanishes, within
-from edgefilter.echo.effects.gain_fit import EXCERPT
+from edgefilter.echo.effects.gain_fit import EXCERPT, STEP, loudest
 from edgefilter.echo.least_squares import hats, normal_equations
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import fit_filter
@@ -21,8 +22,6 @@ from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 SHARES = np.array([0.03, 0.06, 0.1, 0.16, 0.24, 0.35, 0.5, 0.7, 1.0])
 """Knots of a curve to either side, re the highest sample: closer where speech has most of its samples."""
-STEP = 16
-"""Samples (1 ms) from one value of a level, or of a gain by time, to the next."""
 KNOTS, SPACING_DB = 11, 5.0
 """Of the gain over the level, down from the loudest: below lies what the fan hides."""
 ATTACKS_MS, RELEASES_MS = (0.5, 3.0, 15.0, 60.0, 300.0), (10.0, 40.0, 150.0, 600.0, 2000.0)
@@ -112,13 +111,6 @@ class _Ground:
             for other in (self.heard, self.target)
         )
         return energy, cross
-
-    @staticmethod
-    def loudest(energy: Array) -> slice:
-        """The stretch of EXCERPT with most of the energy (k,) of its steps."""
-        total, size = np.cumsum(np.pad(energy, (1, 0))), min(EXCERPT // STEP, energy.size)
-        start = int(np.argmax(total[size:] - total[: total.size - size]))
-        return slice(start, start + size)
 
 
 class FreeCurve(FreeLaw):
@@ -212,9 +204,10 @@ class FreeGain(FreeLaw):
     def fitted(self, ground: _Ground) -> Values:
         loud_db = float(np.ceil(decibels(np.max(block_power(ground.x, SAMPLE_RATE // 50)))))
         bends = np.concatenate((np.diff(np.eye(KNOTS), 2, axis=0), 0.1 * np.diff(np.eye(KNOTS), axis=0)))
-        energy, cross = ground.sums(STEP)
-        part = ground.loudest(energy)
-        energy, cross, x = energy[part], cross[part], ground.x[part.start * STEP : part.stop * STEP]
+        part = loudest(ground.x, ground.weights > 0.0, EXCERPT)
+        steps = slice(part.start // STEP, part.stop // STEP)
+        energy, cross = (sums[steps] for sums in ground.sums(STEP))
+        x = ground.x[steps.start * STEP : steps.stop * STEP]
 
         def knots(times: Times) -> Array:
             return _level_knots(loud_db + OVER_DB[times.peak])
@@ -343,8 +336,7 @@ class FreeFilterAhead(FreeFilter):
 
 def _closer(ground: _Ground, taps: Array) -> Array:
     """The taps of a filter ahead after a step towards the recording, halved as long as it leaves more; (taps,)."""
-    start = int(np.argmax(block_sums(np.square(ground.heard * ground.weights), LEARNT_FROM)))
-    part = slice(start * LEARNT_FROM, (start + 1) * LEARNT_FROM)
+    part = loudest(ground.heard, ground.weights > 0.0, LEARNT_FROM)
     x, weights = ground.x[part], ground.weights[part].copy()
     weights[: SAMPLE_RATE // 2] = 0.0  # in it what was before is missing
 
@@ -526,20 +518,18 @@ def _level_knots(loudest_db: float) -> Array:
 
 def _levels(x: Samples, settings: Sequence[Times], before_db: float = FLOOR_DB) -> Array:
     """Smoothed level, dB re full scale, at the end of each of the k steps of x (n,), for m Times, (m, k); before_db: ahead of x."""
-    rising, falling = (
-        -np.expm1(-1.0 / np.array(ms)) for ms in zip(*((t.attack_ms, t.release_ms) for t in settings), strict=True)
-    )
-    exponents = np.array([t.exponent for t in settings])
     squares = blocks(x, STEP).astype(float) ** 2 + 10.0 ** (FLOOR_DB / 10.0)
-    powers, last = (squares.mean(axis=1), squares.max(axis=1)), len(squares) - 1
-    steps = np.arange(len(squares))
-    wanted = np.stack([powers[t.peak][np.minimum(steps + t.ahead_ms, last)] for t in settings], axis=1) ** exponents
-    level, now = np.empty(wanted.shape), 10.0 ** (before_db / 10.0 * exponents)
-    for row, asked in zip(level, wanted, strict=True):
-        step = asked - now
-        now = now + np.where(step > 0.0, rising, falling) * step
-        row[:] = now
-    return 10.0 * np.log10(level.T) / exponents[:, None]
+    powers, steps = (squares.mean(axis=1), squares.max(axis=1)), np.arange(len(squares))
+    levels = np.empty((len(settings), steps.size))
+    for level, times in zip(levels, settings, strict=True):
+        wanted = powers[times.peak][np.minimum(steps + times.ahead_ms, steps.size - 1)] ** times.exponent
+        rising, falling = (-math.expm1(-1.0 / ms) for ms in (times.attack_ms, times.release_ms))
+        now, smoothed = 10.0 ** (before_db / 10.0 * times.exponent), []
+        for step in wanted.tolist():  # plain numbers: arrays of one cost ten times as much
+            now += (rising if step > now else falling) * (step - now)
+            smoothed.append(now)
+        level[:] = 10.0 * np.log10(smoothed) / times.exponent
+    return levels
 
 
 def _solved(matrix: Array, right: Array, bends: Array) -> tuple[Array, float]:

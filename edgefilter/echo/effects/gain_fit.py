@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
-from edgefilter.dsp.frames import block_power, decibels
+from edgefilter.dsp.frames import block_power, block_sums, blocks, decibels
 from edgefilter.echo.effect import Effect, complete, neutral, within
 from edgefilter.echo.least_squares import RIDGE, at_lags
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
-from edgefilter.types import SAMPLE_RATE, Array, Samples
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 EXCERPT = 8 * SAMPLE_RATE
 """Samples of the stretch that is fitted."""
+STEP = 16
+"""Samples (1 ms) from one value of a level, or of a gain by time, to the next."""
 TAPS = 8
 """Of the nuisance filter on each part of the prediction, half of them ahead: what is linear, the make-up gain included."""
 SETTLED = 1e-3
@@ -30,12 +33,28 @@ class Reach:
     lowest: Array
     highest: Array
 
+    def moved(self, unknowns: Array) -> Iterator[tuple[Array, np.float32]]:
+        """The unknowns (k,) with each of them moved in turn, and by how much."""
+        for place, step in enumerate(np.where(unknowns + self.nudge > self.highest, -self.nudge, self.nudge)):
+            there = unknowns.copy()
+            there[place] += step
+            yield there, np.float32(step)
+
+    def solved(
+        self, residual: Callable[[Array], Array], slopes: Callable[[Array], Array], start: Array
+    ) -> tuple[Array, float]:
+        """The unknowns that leave least of a residual, by its slopes, and the energy that they leave."""
+        edge = 1e-3 * self.nudge  # the solver begins inside of its bounds
+        start, bounds = np.clip(start, self.lowest + edge, self.highest - edge), (self.lowest, self.highest)
+        found = scipy.optimize.least_squares(residual, start, slopes, bounds, x_scale=self.nudge, ftol=SETTLED)
+        return found.x, 2.0 * float(found.cost)
+
 
 class GainFit:
     """Unknowns (k,) with which make(reference, unknowns), a few signals, each through a short filter, explain a recording.
 
-    The filters are solved for at each step (Golub & Pereyra 1973, "variable projection"). loud_db: level of the loudest 20 ms
-    of the excerpt. without: energy that the reference itself leaves of it.
+    The filters are solved for at each step (Golub & Pereyra 1973, "variable projection"). x: the excerpt of the reference.
+    loud_db: level of its loudest 20 ms. without: energy that the reference itself leaves of it.
     """
 
     def __init__(
@@ -50,11 +69,11 @@ class GainFit:
         chosen = measurement.weights[part] > 0.0
         if part.start:
             chosen[: SAMPLE_RATE // 2] = False  # in it the level settles
-        self._x, self._chosen = measurement.reference[part], np.flatnonzero(chosen)
+        self.x, self._chosen = measurement.reference[part], np.flatnonzero(chosen)
         self._target = measurement.whiten(measurement.recording[part])[self._chosen]
-        self.loud_db = float(decibels(np.max(block_power(self._x, SAMPLE_RATE // 50), initial=0.0), 1e-9))
-        left = self._left([self._x])
-        self.without = float(left @ left)
+        self.loud_db = float(decibels(np.max(block_power(self.x, SAMPLE_RATE // 50), initial=0.0), 1e-9))
+        left = self._left([self.x])
+        self.without, self._heard_plain = float(left @ left), self._target - left
 
     def best(self, starts: Sequence[Array]) -> tuple[Array, float] | None:
         """The unknowns that leave least, and that energy; None where they do not pay for themselves by Bayes' criterion (Schwarz 1978)."""
@@ -63,19 +82,34 @@ class GainFit:
         costs = [self.cost(start) for start in starts]
         best, cost = starts[int(np.argmin(costs))], min(costs)
         if self.loud_db > reach.lowest[0] and cost < self.without:
-            edge = 1e-3 * reach.nudge  # the solver begins inside of its bounds
-            solved = scipy.optimize.least_squares(
-                self._residual,
-                np.clip(best, reach.lowest + edge, reach.highest - edge),
-                self._slopes,
-                (reach.lowest, reach.highest),
-                x_scale=reach.nudge,
-                ftol=SETTLED,
-            )
-            best, cost = solved.x, 2.0 * solved.cost
+            best, cost = reach.solved(self._residual, self._slopes, best)
         count = max(self._chosen.size, 2)
         worth = best.size * np.log(count) * cost / count
         return (best, cost) if self.without - cost > worth else None
+
+    def roughly(self, gain: Callable[[Array], Array], starts: Sequence[Array]) -> list[Array]:
+        """The best of some starts, and what least squares make of it, by the gain (steps,) in each STEP that unknowns are.
+
+        As if what is heard in one were what was said in it, through the one filter that is best without a gain.
+        """
+        pairs = self._heard_plain**2, self._heard_plain * self._target
+        whole = np.zeros((2, self.x.size + PRE_ROLL))
+        whole[:, self._chosen] = pairs
+        used, target = (block_sums(each[PRE_ROLL:], STEP) for each in whole)
+        root = np.sqrt(used + 1e-12 * used.mean() + 1e-30)
+        target /= root
+
+        def left(unknowns: Array) -> Array:
+            row = root * gain(unknowns)
+            return target - row * (float(row @ target) / (float(row @ row) + 1e-30))
+
+        def slopes(unknowns: Array) -> Array:
+            here = left(unknowns)
+            return np.stack([(left(there) - here) / step for there, step in self._reach.moved(unknowns)], axis=1)
+
+        starts = [np.clip(start, self._reach.lowest, self._reach.highest) for start in starts]
+        best = min(starts, key=lambda start: float(np.sum(left(start) ** 2)))
+        return [best, self._reach.solved(left, slopes, best)[0]]
 
     def cost(self, unknowns: Array) -> float:
         """Energy that these unknowns leave of the excerpt."""
@@ -91,18 +125,16 @@ class GainFit:
         return np.linalg.solve(normal + RIDGE * np.trace(normal) * np.eye(right.size) + 1e-30, right)
 
     def _residual(self, unknowns: Array) -> Samples:
-        return self._left(self._make(self._x, unknowns))
+        return self._left(self._make(self.x, unknowns))
 
     def _slopes(self, unknowns: Array) -> Array:
         """Derivatives of the residual, (chosen, k), the filters taken to move what is explained, not how (Kaufman 1975)."""
-        reach, sounds = self._reach, self._make(self._x, unknowns)
+        sounds = self._make(self.x, unknowns)
         rows = self._rows(sounds)
         gains = self._weights(rows, self._target).reshape(len(sounds), TAPS).sum(axis=1)
-        steps = np.where(unknowns + reach.nudge > reach.highest, -reach.nudge, reach.nudge)
-        here, moved = gains @ np.stack(sounds), np.empty((self._chosen.size, steps.size), np.float32)
-        for column, step, unit in zip(moved.T, steps, np.eye(steps.size), strict=True):
-            there = gains @ np.stack(self._make(self._x, unknowns + step * unit))
-            column[:] = self._heard((there - here) / np.float32(step))[self._chosen]
+        here, moved = gains @ np.stack(sounds), np.empty((self._chosen.size, unknowns.size), np.float32)
+        for column, (there, step) in zip(moved.T, self._reach.moved(unknowns), strict=True):
+            column[:] = self._heard((gains @ np.stack(self._make(self.x, there)) - here) / step)[self._chosen]
         return rows @ self._weights(rows, moved) - moved
 
     def _left(self, sounds: Sequence[Samples]) -> Samples:
@@ -131,14 +163,23 @@ def fit_one(
     values_of: Callable[[Array], Values],
     reach: Reach,
     starts: Iterable[Sequence[float]],
+    level: Callable[[Samples], Array],
 ) -> Values:
-    """Values of an effect with make-up gain from the best of some starts, in unknowns, the level re the loudest 20 ms; neutral where none pays."""
+    """Values of an effect with make-up gain from the best of some starts, in unknowns, the level re the loudest 20 ms; neutral where none pays.
 
-    def turned(x: Samples, unknowns: Array) -> tuple[Samples]:
-        return (effect.apply(x, complete(effect, values_of(unknowns)), SAMPLE_RATE),)
+    level: amplitude (steps,) of blocks (steps, STEP) by which the effect turns them down.
+    """
+
+    def turned(x: Samples, unknowns: Array, sample_rate: int = SAMPLE_RATE) -> tuple[Samples]:
+        return (effect.apply(x, complete(effect, values_of(unknowns)), sample_rate),)
 
     fit = GainFit(measurement, model, turned, reach)
-    found = fit.best([np.array((fit.loud_db + above, *others)) for above, *others in starts])
+    amplitude = level(blocks(fit.x, STEP)) + 1e-9
+
+    def gain(unknowns: Array) -> Array:
+        return turned(amplitude, unknowns, SAMPLE_RATE // STEP)[0] / amplitude
+
+    found = fit.best(fit.roughly(gain, [np.array((fit.loud_db + above, *others)) for above, *others in starts]))
     if found is None:
         return neutral(effect)
     makeup_db = 20.0 * np.log10(max(float(fit.gains(found[0])[0]), 1e-2))
@@ -146,14 +187,16 @@ def fit_one(
 
 
 def excerpt(measurement: Measurement, model: VoiceModel, size: int) -> slice:
-    """The loudest stretch of so many samples of the reference, or the first one where the model knows what time it is.
+    """The loudest stretch of so many samples of the reference, or the first one where the model knows what time it is."""
+    fitted = measurement.weights > 0.0
+    return slice(0, size) if model.timed else loudest(measurement.reference, fitted, size)
 
-    Of those of which about as much may be fitted to as of any.
-    """
-    x = measurement.reference
-    if model.timed or x.size <= size:
-        return slice(0, size)
-    sums = (np.cumsum(np.pad(each, (1, 0)), dtype=np.float64) for each in (np.square(x), measurement.weights > 0.0))
-    energy, fitted = (total[size:] - total[:-size] for total in sums)
-    start = int(np.argmax(np.where(2.0 * fitted >= fitted.max(), energy, -1.0)))
+
+def loudest(x: Samples, fitted: NDArray[np.bool_], size: int) -> slice:
+    """The loudest stretch of so many samples of x (n,), of those of which about as much may be fitted to as of any."""
+    if x.size <= size:
+        return slice(0, x.size)
+    sums = (np.cumsum(np.pad(each, (1, 0)), dtype=np.float64) for each in (np.square(x), fitted))
+    energy, usable = (total[size:] - total[:-size] for total in sums)
+    start = int(np.argmax(np.where(2.0 * usable >= usable.max(), energy, -1.0)))
     return slice(start, start + size)

@@ -104,7 +104,9 @@ def fit_path(measurement: Measurement, model: VoiceModel) -> tuple[Array, float,
         return taps, 0.0, False
     rt60 = reverberation_time(after(taps)) or reverberation_time(before[direct:])
     if rt60 > 0.0:
-        taps = fit_filter(x, residual, measurement.weights, length, 0, decaying(taps, SLOWER * rt60), steps=60)
+        expected, noise = decaying(taps, SLOWER * rt60), block_energy(taps)[1] / BLOCK
+        known = taps * expected / (expected + noise + 1e-30)  # as if one tap's error said nothing of another's
+        taps = fit_filter(x, residual, measurement.weights, length, 0, expected, steps=20, start=known)
     return scale * taps, rt60, centre_time(after(taps)) > LONGER * centre_time(before[direct:])
 
 

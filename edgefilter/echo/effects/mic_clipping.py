@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from edgefilter.echo.effect import NEVER_REACHED, Effect, Parameter, first, neutral
+from edgefilter.echo.effects.gain_fit import EXCERPT, loudest
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -43,8 +44,9 @@ class MicClipping(Effect):
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """The level and hardness that leave the least of the whitened recording, a gain free in each; neutral where none does."""
-        predicted, recording = measurement.predicted(model)[0], measurement.white_recording
-        chosen = measurement.weights
+        part = loudest(measurement.recording, measurement.weights > 0.0, EXCERPT)
+        chosen, recording = measurement.weights[part], measurement.whiten(measurement.recording[part])
+        predicted = measurement.predicted(model)[0][part]
         top = float(np.max(np.abs(measurement.recording), initial=0.0))
         if top <= 1e-4:
             return neutral(self)

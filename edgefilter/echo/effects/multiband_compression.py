@@ -74,7 +74,7 @@ class MultibandCompression(Effect):
 
         Neutral where the bands do not pay.
         """
-        crossed = find_crossovers(spectra(measurement, measurement.predicted(model)[1], RESOLUTION_HZ))
+        crossed = find_crossovers(spectra(measurement, model, RESOLUTION_HZ))
         if crossed is None:
             return neutral(self)
         low, high, delay = crossed
@@ -149,27 +149,33 @@ def find_crossovers(found: Spectra) -> tuple[float, float, float] | None:
     None where the bands explain as much without these phases: then nothing was cut into bands.
     """
     turned = found.cross[:, None] * np.exp(2j * np.pi * np.outer(found.hz, DELAYS) / SAMPLE_RATE)
+    turned = np.concatenate((turned.real, turned.imag))
 
-    def explained(bands: NDArray[np.complex128]) -> tuple[float, float]:
-        matrix = (bands.conj().T @ (found.predicted[:, None] * bands)).real
-        right = (bands.conj().T @ turned).real
-        gains = np.linalg.solve(matrix + (1e-9 * np.trace(matrix) + 1e-12) * np.eye(BANDS), right)
-        worth = np.where((gains > 0.0).all(axis=0), np.sum(gains * right, axis=0), -np.inf)
-        return float(np.max(worth)), float(DELAYS[int(np.argmax(worth))])
+    def explained(bands: NDArray[np.complex128]) -> Array:
+        """Of several bands (pairs, BANDS, m) what they explain at each delay, (pairs, delays); not where one is turned over."""
+        both = np.concatenate((bands.real, bands.imag), axis=2)
+        matrix = both * np.tile(found.predicted, 2) @ both.swapaxes(1, 2)
+        right = both @ turned
+        held = 1e-9 * np.trace(matrix, axis1=1, axis2=2) + 1e-12
+        gains = np.linalg.solve(matrix + held[:, None, None] * np.eye(BANDS), right)
+        return np.where((gains > 0.0).all(axis=1), np.sum(gains * right, axis=1), -np.inf)
 
-    best, most, without = (0.0, 0.0, 0.0), -np.inf, -np.inf
-    for finer in (False, True):
-        lows, highs = (best[0] * FINER, best[1] * FINER) if finer else (LOW_HZ, HIGH_HZ)
-        below, above = ({hz: _halves(found.hz, hz) for hz in side} for side in (lows, highs))
-        for low, high in product(lows, highs):
-            (bass, rest), (middle, treble) = below[low], above[high]
-            bands = np.stack((bass, rest * middle, rest * treble), axis=1)
-            without = max(without, explained(np.abs(bands).astype(complex))[0])
-            with_phase, delay = explained(bands)
-            if with_phase > most:
-                best, most = (float(low), float(high), delay), with_phase
+    low_hz, high_hz, most, without = LOW_HZ, HIGH_HZ, -np.inf, -np.inf
+    best = 0.0, 0.0, 0.0
+    for _ in range(2):
+        pairs = list(product(low_hz, high_hz))
+        below, above = ({hz: _halves(found.hz, hz) for hz in side} for side in (low_hz, high_hz))
+        cut = ((*below[low], *above[high]) for low, high in pairs)
+        bands = np.stack([(bass, rest * middle, rest * treble) for bass, rest, middle, treble in cut])
+        without = max(without, float(explained(np.abs(bands).astype(complex)).max()))
+        worth = explained(bands)
+        if worth.max() > most:
+            most = float(worth.max())
+            pair, delay = divmod(int(worth.argmax()), DELAYS.size)
+            best = *pairs[pair], float(DELAYS[delay])
         if not most > without:
             return None
+        low_hz, high_hz = best[0] * FINER, best[1] * FINER
     return best
 
 

@@ -67,12 +67,17 @@ class PathChange(Effect):
             explained = np.cumsum(measurement.weights * change * (2.0 * residual - change), dtype=np.float64)
             start = edge + int(np.argmin(explained[edge : max(x.size - edge, edge + 1)]))
             time = start / SAMPLE_RATE
-        if explained[start] > 0.0:
-            return neutral(self)
+            if explained[start] > 0.0:
+                return neutral(self)
+        first = max(
+            int((time - 1.2) * SAMPLE_RATE), 0
+        )  # before this second and after it none of the fades that are tried differ
+        part = slice(first, int((time + 1.2) * SAMPLE_RATE))
+        around, turned, begin = residual[part], change[part], first / SAMPLE_RATE
         errors = {}
         for length in (0.01, 0.3, 0.6, 1.0):
             for at in time + np.arange(-0.6, 0.61, 0.1):
-                left = residual - _fade(x.size, at, length, SAMPLE_RATE) * change
+                left = around - _fade(around.size, at - begin, length, SAMPLE_RATE) * turned
                 errors[(at, length)] = float(np.dot(left, left))
         time, duration = min(errors, key=lambda found: errors[found])
         time = min(time, x.size / SAMPLE_RATE)

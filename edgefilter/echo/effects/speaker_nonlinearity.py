@@ -10,7 +10,7 @@ import numpy as np
 
 from edgefilter.dsp.membrane import MOTION_TAPS, motion
 from edgefilter.echo.effect import Effect, Parameter, first, neutral, within
-from edgefilter.echo.effects.gain_fit import excerpt
+from edgefilter.echo.effects.gain_fit import EXCERPT, excerpt
 from edgefilter.echo.least_squares import CHUNK, NUISANCE_LEAD, NUISANCE_TAPS, RIDGE, at_lags, ridge_solved
 from edgefilter.echo.measurement import ORDINARY_DB, Measurement, Values, VoiceModel, level_ratio
 from edgefilter.echo.recording import BLOCK
@@ -18,14 +18,13 @@ from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 BOUND = 4.0
 """Of each weight: at the end of its excursion a law is off by no more than this, whatever is played."""
-EXCERPT = 10 * SAMPLE_RATE
-"""Samples of the stretch on which it is chosen where the laws bend; how much they do, on all."""
 DRIVER, AMPLIFIER = ("force_factor", "stiffness", "damping"), ("even", "odd")
 """The laws, with two weights each."""
 RESONANCES_HZ, REACH_HZ = (250.0, 180.0, 215.0, 300.0, 370.0), (160.0, 1000.0)
 """Of small drivers, the usual one first; how low is tried, where MOTION_TAPS are just enough, and how high."""
 EXCURSION, KNEES = 0.7, (0.3, 0.15, 0.6)
-"""Where the laws bend, re the largest displacement and the highest sample that the fit has seen; the usual ones first."""
+"""Where the laws bend, re the largest displacement and the highest sample that the fit has seen; the usual ones first. Chosen on an
+EXCERPT; how much they bend, on all."""
 PEAK = 0.9999
 """The largest is this quantile."""
 HELD = 1e-3
