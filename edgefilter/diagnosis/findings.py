@@ -85,8 +85,8 @@ def _intervals(recording: Straightened, model: EchoModel, step: Trial) -> tuple[
     fits, failed = [], []
     for third in range(3):
         try:
-            part = recording.behind(others).fitted_to(recording.usable & (block % 3 == third))
-            fits.append(others.fitted(step.name, part.measurement))
+            part = recording.fitted_to(recording.usable & (block % 3 == third))
+            fits.append(part.fitted(step.name, others))
         except (UsageError, ArithmeticError, np.linalg.LinAlgError) as error:
             failed.append(
                 f"how well {step.name} is known is told by fits to a third of the recording each, and one failed:"

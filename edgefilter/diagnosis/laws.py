@@ -169,7 +169,7 @@ def _tried(found: Found, name: str, kept: Iterable[str]) -> Trial | None:
     for other in kept:
         others = others.with_effect(other, known[other])
     try:
-        values = others.fitted(name, found.recording.behind(others).measurement)
+        values = found.recording.fitted(name, others)
     except (UsageError, ArithmeticError, np.linalg.LinAlgError):
         return None
     if vanishes(find(name), values):

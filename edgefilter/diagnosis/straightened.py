@@ -14,9 +14,12 @@ from scipy.ndimage import uniform_filter1d
 
 from edgefilter.dsp import fourier
 from edgefilter.dsp.convolution import filtered
+from edgefilter.dsp.fractional_delay import interpolate
 from edgefilter.dsp.frames import decibels, frames
 from edgefilter.dsp.psd import GRID_BINS, ROUNDING_PSD, coloured, floored, frequencies, hann, variance_at
 from edgefilter.dsp.stft import StftConfig
+from edgefilter.echo.effect import STAGES
+from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.least_squares import normal_equations
 from edgefilter.echo.measurement import Measurement, level_ratio
 from edgefilter.echo.model import EchoModel
@@ -104,6 +107,7 @@ class Straightened:
     warnings: tuple[str, ...] = ()
     ordinary: tuple[tuple[Samples, Array], ...] = ()
     _behind: dict[bytes, Straightened] = field(default_factory=dict, init=False, repr=False)
+    _unmoved: dict[bytes, Measurement] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def held_out(self) -> NDArray[np.bool_]:
@@ -133,6 +137,24 @@ class Straightened:
         if (key := psd.tobytes()) not in self._behind:
             self._behind[key] = replace(self, measurement=replace(self.measurement, noise_psd=psd), model=model)
         return self._behind[key]
+
+    def fitted(self, name: str, model: EchoModel) -> dict[str, float | Array]:
+        """All values of an effect that a model has not, in the noise that this expects; of one ahead of a drift without the drift."""
+        here = self.behind(model)
+        if STAGES.index(find(name).stage) >= STAGES.index("time") or (read := model.read_at(self.usable.size)) is None:
+            return model.fitted(name, here.measurement)
+        if (key := read.tobytes()) not in here._unmoved:
+            here._unmoved[key] = here._without(read)
+        return model.still.fitted(name, here._unmoved[key])
+
+    def _without(self, read: Array) -> Measurement:
+        """The measurement with its recording as it was ahead of what read its samples there, (n,)."""
+        n = np.arange(read.size)
+        at = np.interp(n, read, n)
+        # at twice the rate, where the filter that reads between samples passes all of the band
+        spectrum = fft.rfft(np.pad(self.measurement.recording, (0, SPAN)))
+        twice = fft.irfft(2.0 * spectrum, 2 * (n.size + SPAN))[: 2 * n.size].astype(np.float32)
+        return replace(self.measurement, recording=interpolate(twice, 2.0 * at), fit=self.fit[np.rint(at).astype(int)])
 
     @cached_property
     def starts(self) -> NDArray[np.signedinteger]:

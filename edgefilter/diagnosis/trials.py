@@ -193,7 +193,7 @@ class Workbench:
             self._progress(f"trying {name}{self._so_far}")
         effect, others = find(name), model.without_effect(name)
         try:
-            values = others.fitted(name, self.recording.behind(others).measurement)
+            values = self.recording.fitted(name, others)
         except (UsageError, ArithmeticError, np.linalg.LinAlgError) as error:
             self._failed[name] = f"{name} could not be fitted and was left out: {error}"
             return None

@@ -97,6 +97,10 @@ class Effect:
         """The signal (n,) after the effect; x is not written to. By default x itself, as for an effect of stage "noise"."""
         return x.copy()
 
+    def read_at(self, values: Values, size: int, sample_rate: int) -> Array | None:
+        """Of an effect that only moves sound in time: the position in x from which each sample behind it comes, (size,), rising; None otherwise."""
+        return None
+
     def run(self, values: Values, sample_rate: int) -> Runner | None:
         """The effect on a stream, for one that remembers much or follows what the microphone hears; None: apply is all there is."""
         return None

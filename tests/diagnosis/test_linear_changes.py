@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from edgefilter.diagnosis.recording import diagnose
+from edgefilter.diagnosis.recording import Recording, diagnose
 from edgefilter.dsp.fractional_delay import delayed
+from edgefilter.echo.effect import vanishes
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.measurement import Values
 from edgefilter.echo.model import EchoModel
 from edgefilter.types import PRE_ROLL
-from tests.diagnosis.robot_scene import DELAY, FAN, path, profile, voice
+from tests.diagnosis.robot_scene import DELAY, FAN, path, profile, record, voice
 
 RATE = 16000
 SHELF_HZ = 2500.0
@@ -113,6 +114,15 @@ def test_a_turned_volume_is_named_beside_a_filter_that_could_take_it_up(
     assert (found.verdict, {finding.effect for finding in found.ranking}) == ("missing", {beside, "playback_gain"})
     volume = next(finding for finding in found.ranking if finding.effect == "playback_gain")
     assert volume.values["gain_db"] == pytest.approx(turned_db, abs=0.3)
+
+
+def test_beside_a_drift_an_effect_is_fitted_to_a_recording_without_it() -> None:
+    x, drift = voice(10.0), {"ppm": 200.0, "offset": 3.0}
+    robot = EchoModel(SHELVED.astype(np.float32)).with_effect("clock_drift", drift)
+    recording = Recording(record(x, robot), x, profile()).straightened
+    model = recording.model.with_effect("clock_drift", recording.fitted("clock_drift", recording.model))
+    assert_gain_of_the_shelf(recording.fitted("equaliser", model))
+    assert vanishes(find("bandlimit"), recording.fitted("bandlimit", model))  # reading between samples takes no treble
 
 
 @pytest.mark.slow
