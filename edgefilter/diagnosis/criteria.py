@@ -43,10 +43,6 @@ class Criteria:
     worth_db: float = 0.02
     """Fall in level below which another round changes nothing that can be seen."""
 
-    # Backward: what the later effects have made superfluous
-    simple: int = 1
-    """Complexity up to which an effect is simple beside any flexible one."""
-
     # Where a search ends
     silent_db: float = 0.2
     """Where the residual is no more than this above that of the robot's silences, nothing of the voice is in it, and

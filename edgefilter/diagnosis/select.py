@@ -58,9 +58,9 @@ def _stepwise(bench: Workbench, start: EchoModel) -> Iterator[EchoModel]:
         yield standing(bench, start, model)
 
 
-def forward(bench: Workbench, model: EchoModel, most: int = 9) -> Trial | None:
+def forward(bench: Workbench, model: EchoModel) -> Trial | None:
     """The effect to accept next: it explains a good part of what is left."""
-    return bench.preferred(trial for trial in bench.attempt_all(model, most) if bench.worth(trial, model))
+    return bench.preferred(trial for trial in bench.attempt_all(model) if bench.worth(trial, model))
 
 
 def refit(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
@@ -97,10 +97,9 @@ def backward(bench: Workbench, start: EchoModel, model: EchoModel, newest: str) 
 
 
 def _exchange(bench: Workbench, start: EchoModel, model: EchoModel, name: str) -> EchoModel:
-    """The model with another effect instead of that one where, beside the others, the other is the one to name."""
+    """The model with a simpler effect instead of that one where, beside the others, the simpler one is the one to name."""
     others = bench.less(model, name)
-    trials = bench.attempt_all(others, find(name).complexity)
-    rivals = [t for t in trials if t.name != name and not find(t.name).last_resort and bench.admissible(t)]
+    rivals = [trial for trial in bench.attempt_simpler(name, others) if bench.admissible(trial)]
     chosen = bench.preferred([*rivals, bench.beside(name, others, model)])
     if chosen is None or chosen.name == name:
         return model
@@ -111,7 +110,7 @@ def _exchange(bench: Workbench, start: EchoModel, model: EchoModel, name: str) -
 
 
 def split(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
-    """The model with a simple effect beside each one whose fit has taken that up as well."""
+    """The model with a simpler effect beside each one whose fit has taken that up as well."""
     for name in added(start, model):
         apart = _apart(bench, model, name)
         if apart is not model and standing(bench, start, apart) is apart:
@@ -120,11 +119,14 @@ def split(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
 
 
 def _apart(bench: Workbench, model: EchoModel, name: str) -> EchoModel:
-    """The model with a simple effect beside the one of that name, where its fit has taken that one up as well; or as it is."""
+    """The model with a simpler effect beside the one of that name, where its fit has taken that one up as well; or as it is."""
     effect, values, others = find(name), dict(model.effects)[name], bench.less(model, name)
     only = effect.only(values)
+    if only is values:
+        return model
     bare = others.with_effect(name, only)
-    simple = None if only is values else forward(bench, bare, bench.criteria.simple)
+    simpler = bench.attempt_simpler(name, bare, rigid=True)
+    simple = bench.preferred(trial for trial in simpler if bench.worth(trial, bare))
     if simple is None:
         return model
     grown = both = simple.model
@@ -136,7 +138,9 @@ def _apart(bench: Workbench, model: EchoModel, name: str) -> EchoModel:
         again = bench.attempt(simple.name, bench.less(both.with_effect(name, effect.only(fitted.values)), simple.name))
         if again is None:
             return model
-        grown = again.model
+        before, grown = bench.score(grown).level_db, again.model
+        if before - bench.score(grown).level_db < bench.criteria.worth_db:
+            break
     lost, left = (bench.score(m).level_db - bench.score(model).level_db for m in (bare, grown))
     return both if left <= (1.0 - bench.criteria.nearly) * lost else model
 

@@ -215,13 +215,19 @@ class Workbench:
         """Whether a trial takes away half of the power over the fan, though the level hardly falls, as a narrow ring does, in few cells."""
         return share_of(self.score(model).active_db, trial.score.active_db) > self.criteria.half
 
-    def attempt_all(self, model: EchoModel, most: int = 9) -> list[Trial]:
-        """Each effect that the model has not and whose complexity is at most `most`.
+    def attempt_simpler(self, name: str, model: EchoModel, rigid: bool = False) -> list[Trial]:
+        """Each effect of that one's family that is simpler; rigid: only of few numbers. Of two flexible ones either may be in the other."""
+        rich, known = find(name), [find(other) for other in self.absent(model)]
+        simpler = [one for one in known if one.family == rich.family and one.complexity < rich.complexity]
+        return self._attempt_in_turn([one.name for one in simpler if not (rigid and one.flexible)], model)
+
+    def attempt_all(self, model: EchoModel) -> list[Trial]:
+        """Each effect that the model has not.
 
         Where none of them explains a good part of what is left, a nonlinear loudspeaker with a filter ahead of it; the last
         resorts only where that does not either.
         """
-        absent = self.absent(model, most)
+        absent = self.absent(model)
         found = self._attempt_in_turn([name for name in absent if not find(name).last_resort], model)
         if self.little(model) or any(self.worth(trial, model) for trial in found):
             return found
@@ -303,10 +309,10 @@ class Workbench:
         taken_up = find(one.name).flexible and other.gain_db >= self.criteria.nearly * one.gain_db
         return not (by_chance or taken_up)
 
-    def absent(self, model: EchoModel, most: int) -> list[str]:
-        """Names of the effects that a model has not, or as the start has them, that may be tried and whose complexity is at most `most`."""
+    def absent(self, model: EchoModel) -> list[str]:
+        """Names of the effects that a model has not, or as the start has them, and that may be tried."""
         out = {*added(self._start, model), *self._without}
-        return [n for n in names() if n not in out and find(n).complexity <= most and not find(n).free]
+        return [name for name in names() if name not in out and not find(name).free]
 
     def less(self, model: EchoModel, name: str) -> EchoModel:
         """The model without what it has of that effect beyond the start."""
