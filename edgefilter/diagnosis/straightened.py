@@ -141,8 +141,9 @@ class Straightened:
     def fitted(self, name: str, model: EchoModel) -> dict[str, float | Array]:
         """All values of an effect that a model has not, in the noise that this expects; of one ahead of a drift without the drift."""
         here = self.behind(model)
-        if STAGES.index(find(name).stage) >= STAGES.index("time") or (read := model.read_at(self.usable.size)) is None:
+        if model.still is model or STAGES.index(find(name).stage) >= STAGES.index("time"):
             return model.fitted(name, here.measurement)
+        read = model.read_at(self.usable.size)
         if (key := read.tobytes()) not in here._unmoved:
             here._unmoved[key] = here._without(read)
         return model.still.fitted(name, here._unmoved[key])
@@ -154,7 +155,8 @@ class Straightened:
         # at twice the rate, where the filter that reads between samples passes all of the band
         spectrum = fft.rfft(np.pad(self.measurement.recording, (0, SPAN)))
         twice = fft.irfft(2.0 * spectrum, 2 * (n.size + SPAN))[: 2 * n.size].astype(np.float32)
-        return replace(self.measurement, recording=interpolate(twice, 2.0 * at), fit=self.fit[np.rint(at).astype(int)])
+        moved, fit = interpolate(twice, 2.0 * at), self.fit[np.rint(at).astype(int)]
+        return replace(self.measurement, recording=moved, fit=fit)
 
     @cached_property
     def starts(self) -> NDArray[np.signedinteger]:

@@ -97,9 +97,9 @@ class Effect:
         """The signal (n,) after the effect; x is not written to. By default x itself, as for an effect of stage "noise"."""
         return x.copy()
 
-    def read_at(self, values: Values, size: int, sample_rate: int) -> Array | None:
-        """Of an effect that only moves sound in time: the position in x from which each sample behind it comes, (size,), rising; None otherwise."""
-        return None
+    def read_at(self, values: Values, size: int, sample_rate: int) -> Array:
+        """Of an effect of stage "time" that only moves sound: the position in x from which each sample behind it comes, (size,), rising."""
+        return np.arange(float(size))
 
     def run(self, values: Values, sample_rate: int) -> Runner | None:
         """The effect on a stream, for one that remembers much or follows what the microphone hears; None: apply is all there is."""
@@ -197,6 +197,11 @@ class Effect:
     def noise_is_asked(self) -> bool:
         """Whether the running filter asks for variance()."""
         return self.adds_noise and not self.followed
+
+    @property
+    def only_moves(self) -> bool:
+        """Whether a recording can be read as it was ahead of it."""
+        return self.stage == "time" and type(self).read_at is not Effect.read_at
 
     @property
     def timed(self) -> bool:

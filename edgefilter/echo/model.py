@@ -207,21 +207,14 @@ class EchoModel:
     @cached_property
     def still(self) -> EchoModel:
         """The model without the effects that only move what is heard in time; itself where it has none."""
-        return self._with_those(lambda name, values: find(name).stage != "time" or self._reads(name, values, 0) is None)
+        return self._with_those(lambda name, _: not find(name).only_moves)
 
-    def read_at(self, size: int) -> Array | None:
-        """The position in what `still` predicts from which each sample of what the model predicts comes, (size,); None where nothing is moved."""
-        if self.still is self:
-            return None
-        read = np.arange(float(size))
+    def read_at(self, size: int) -> Array:
+        """The position in what `still` predicts from which each sample of what the model predicts comes, (size,)."""
+        read = n = np.arange(float(size))
         for effect, values in reversed(chain(self.effects)):
-            moved = self._reads(effect.name, values, size) if effect.stage == "time" else None
-            read = read if moved is None else np.interp(read, np.arange(size), moved)
+            read = np.interp(read, n, effect.read_at(values, size, SAMPLE_RATE)) if effect.only_moves else read
         return read
-
-    @staticmethod
-    def _reads(name: str, values: Values, size: int) -> Array | None:
-        return find(name).read_at(complete(find(name), values), size, SAMPLE_RATE)
 
     def lasting(self) -> EchoModel:
         """What holds of the robot in any recording: the model without its events."""

@@ -57,7 +57,7 @@ class Compression(Effect):
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """From the best of a grid of thresholds, slopes and releases (gain_fit)."""
-        return fit_one(self, measurement, model, self._values, REACH, STARTS, root_mean_square)
+        return fit_one(self, measurement, model, self._values, REACH, STARTS)
 
     def _values(self, unknowns: Array) -> Values:
         threshold_db, slope, attack, release = unknowns
@@ -69,11 +69,6 @@ class Compression(Effect):
             f"the voice is turned down when it has been loud: above {first(values, 'threshold_db'):.0f} dB "
             f"by {first(values, 'ratio'):.1f} to 1, while the fan is as loud as ever"
         )
-
-
-def root_mean_square(pieces: Samples) -> Array:
-    """Of each of some pieces of sound (k, n), (k,)."""
-    return np.sqrt(np.mean(pieces**2, axis=1))
 
 
 class Compressor:

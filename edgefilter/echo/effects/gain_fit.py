@@ -163,18 +163,19 @@ def fit_one(
     values_of: Callable[[Array], Values],
     reach: Reach,
     starts: Iterable[Sequence[float]],
-    level: Callable[[Samples], Array],
+    by_peaks: bool = False,
 ) -> Values:
     """Values of an effect with make-up gain from the best of some starts, in unknowns, the level re the loudest 20 ms; neutral where none pays.
 
-    level: amplitude (steps,) of blocks (steps, STEP) by which the effect turns them down.
+    by_peaks: whether it hears these rather than the mean square.
     """
 
     def turned(x: Samples, unknowns: Array, sample_rate: int = SAMPLE_RATE) -> tuple[Samples]:
         return (effect.apply(x, complete(effect, values_of(unknowns)), sample_rate),)
 
     fit = GainFit(measurement, model, turned, reach)
-    amplitude = level(blocks(fit.x, STEP)) + 1e-9
+    size = np.abs(blocks(fit.x, STEP))
+    amplitude = (size.max(axis=1) if by_peaks else np.sqrt(np.mean(size**2, axis=1))) + 1e-9
 
     def gain(unknowns: Array) -> Array:
         return turned(amplitude, unknowns, SAMPLE_RATE // STEP)[0] / amplitude

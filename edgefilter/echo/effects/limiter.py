@@ -55,7 +55,7 @@ class Limiter(Effect):
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """From the best of a grid of ceilings and releases (gain_fit)."""
-        values = fit_one(self, measurement, model, self._values, REACH, STARTS, peaks)
+        values = fit_one(self, measurement, model, self._values, REACH, STARTS, by_peaks=True)
         peak_db = 20.0 * np.log10(float(np.max(np.abs(measurement.reference), initial=0.0)) + 1e-12)
         return within(self, {**values, "taken_db": peak_db - first(values, "ceiling_db")})
 
@@ -68,11 +68,6 @@ class Limiter(Effect):
             f" turned down by {first(values, 'taken_db'):.1f} dB, and the gain comes back in"
             f" {first(values, 'release_ms'):.0f} ms"
         )
-
-
-def peaks(pieces: Samples) -> Array:
-    """Of each of some pieces of sound (k, n), (k,)."""
-    return np.max(np.abs(pieces), axis=1)
 
 
 class PeakLimiter:
