@@ -248,6 +248,7 @@ def first(values: Values, name: str) -> float:
     return float(np.ravel(values[name])[0])
 
 
-def numbers(values: Values, name: str) -> Array:
-    """A parameter as an array, also where it is one number, (k,) float64."""
-    return np.atleast_1d(np.asarray(values[name], float))
+def numbers(values: Values, name: str, size: int | None = None) -> Array:
+    """A parameter as an array, also where it is one number, (k,) float64; with a size as one of that size, not to be written to."""
+    found = np.atleast_1d(np.asarray(values[name], float))
+    return found if size is None else np.broadcast_to(found, size)

@@ -148,11 +148,11 @@ class Bandlimit(Effect):
         passed = gain_db[(hz > PASSED_HZ) & (hz < 0.6 * float(values["cutoff_hz"]))]
         if not passed.size or float(np.std(passed)) > FLAT_DB:
             return values
-        taps, gain = numbers(values, "taps"), 10 ** (float(np.median(passed)) / 20)
+        taps, gain = numbers(values, "taps", TAPS), 10 ** (float(np.median(passed)) / 20)
         plain = np.zeros(TAPS, np.float32)
         plain[LEAD] = 1.0
         plain = self.apply(plain, {**values, "taps": 0.0}, SAMPLE_RATE)
-        return {**values, "taps": (np.broadcast_to(taps, TAPS) + plain) / gain - plain}
+        return {**values, "taps": (taps + plain) / gain - plain}
 
 
 def band_edge(found: Spectra) -> float | None:

@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 
 from edgefilter.dsp.frames import decibels
-from edgefilter.echo.effect import Effect, Parameter, first, neutral, within
+from edgefilter.echo.effect import Effect, Parameter, first, neutral, numbers, within
 from edgefilter.echo.effects.codec_signs import HEARD, is_codec
 from edgefilter.echo.effects.knock_power import (
     BANDS,
@@ -57,7 +57,7 @@ class Codec(Effect):
 
     def variance(self, reference: Samples, values: Values, sample_rate: int) -> Samples:
         """What the noise adds to the expected square of each sample at the microphone, band by band, for an aligned reference (n,); (16, n)."""
-        power = np.broadcast_to(np.asarray(values["power"], float), (BANDS,))
+        power = numbers(values, "power", BANDS)
         frames = power * _levels(reference, float(values["decay_ms"])) ** float(values["exponent"])
         spread = np.repeat(frames.T.astype(np.float32), HOP, axis=1)
         return np.pad(spread, ((0, 0), (FRAME // 2, reference.size)), mode="edge")[:, : reference.size]

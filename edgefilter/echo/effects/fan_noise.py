@@ -8,7 +8,7 @@ from edgefilter.dsp.convolution import filtered
 from edgefilter.dsp.frames import decibels, frames
 from edgefilter.dsp.psd import GRID_BINS, floored, periodograms
 from edgefilter.dsp.tones import tones
-from edgefilter.echo.effect import NEVER_S, RECORDING, Effect, Parameter, first, neutral, within
+from edgefilter.echo.effect import NEVER_S, RECORDING, Effect, Parameter, first, neutral, numbers, within
 from edgefilter.echo.least_squares import absorbed
 from edgefilter.echo.measurement import SILENT, STEADY_DB, Measurement, Values, VoiceModel
 from edgefilter.types import SAMPLE_RATE, Array, Samples
@@ -45,7 +45,7 @@ class FanNoise(Effect):
         start = round(first(values, "from_s") * sample_rate)
         if start == 0:
             return noise
-        taps = np.fft.irfft(10.0 ** (-np.broadcast_to(values["spectrum_db"], GRID_BINS) / 20.0))
+        taps = np.fft.irfft(10.0 ** (-numbers(values, "spectrum_db", GRID_BINS) / 20.0))
         before = filtered(noise[:start], np.roll(taps, GRID_BINS - 1), GRID_BINS - 1)
         return np.concatenate((before, noise[start:]))
 

@@ -132,7 +132,7 @@ class FreeCurve(FreeLaw):
             return x.copy()
         peak, shares = first(values, "peak"), self.knots
         ends = np.concatenate(([-5.0], shares, [5.0]))
-        bend = _spread(values, "bend", shares.size)
+        bend = numbers(values, "bend", shares.size)
         slopes = np.diff(bend)[[0, -1]] / np.diff(shares)[[0, -1]]
         heights = np.concatenate(([bend[0] - 4.0 * slopes[0]], bend, [bend[-1] + 4.0 * slopes[1]]))
         return (x + peak * np.interp(x / peak, ends, heights)).astype(np.float32)
@@ -148,7 +148,7 @@ class FreeCurve(FreeLaw):
 
     def drawn(self, values: Values) -> Drawn:
         knots = np.delete(self.knots, SHARES.size)
-        heights = knots + np.delete(_spread(values, "bend", self.knots.size), SHARES.size)
+        heights = knots + np.delete(numbers(values, "bend", self.knots.size), SHARES.size)
         gain = heights / knots
         middle = 0.5 * (gain[SHARES.size - 1] + gain[SHARES.size]) or 1.0
         gain_db = _gain_db(gain / middle)
@@ -246,7 +246,7 @@ class FreeGain(FreeLaw):
         }
 
     def drawn(self, values: Values) -> Drawn:
-        return "level", "dBFS", _level_knots(first(values, "loudest_db")), _spread(values, "gain_db", KNOTS), "dB"
+        return "level", "dBFS", _level_knots(first(values, "loudest_db")), numbers(values, "gain_db", KNOTS), "dB"
 
     def sentence(self, values: Values) -> str:
         _, _, knots, gain_db, _ = self.drawn(values)
@@ -274,7 +274,7 @@ class _GainByLevel:
             first(values, "exponent"),
         )
         self._knots = _level_knots(first(values, "loudest_db"))
-        self._gain_db = _spread(values, "gain_db", KNOTS)
+        self._gain_db = numbers(values, "gain_db", KNOTS)
         self._level_db, self._gain = FLOOR_DB, 10.0 ** (float(self._gain_db[0]) / 20.0)
 
     def __call__(self, x: Samples, heard: Samples | None = None) -> Samples:
@@ -393,7 +393,7 @@ class FreeModulation(FreeLaw):
         return {"rate_hz": rate, "mean": found[0], "waves": found[1:] / found[0]} if found[0] > 0.0 else {}
 
     def drawn(self, values: Values) -> Drawn:
-        rate, waves = first(values, "rate_hz"), _spread(values, "waves", 2 * HARMONICS)
+        rate, waves = first(values, "rate_hz"), numbers(values, "waves", 2 * HARMONICS)
         time = np.linspace(0.0, 1.0 / rate, 65)
         return "time in a period", "s", time, _gain_db(1.0 + waves @ _waves(rate, time * SAMPLE_RATE)), "dB"
 
@@ -407,7 +407,7 @@ class _Waves:
 
     def __init__(self, values: Values) -> None:
         self._rate, self._mean = first(values, "rate_hz"), first(values, "mean")
-        self._weights = _spread(values, "waves", 2 * HARMONICS)
+        self._weights = numbers(values, "waves", 2 * HARMONICS)
         self._at, self._power = 0, 0.0
 
     def __call__(self, x: Samples, heard: Samples | None = None) -> Samples:
@@ -499,11 +499,6 @@ def _by_rate(energy: Array, cross: Array) -> tuple[Array, Array]:
     matrix += (1e-6 * own[0].real + 1e-30) * np.eye(3)
     found = np.linalg.solve(matrix, right[:, :, None])[:, :, 0]
     return rates * per, np.sum(found * right, axis=1)
-
-
-def _spread(values: Values, name: str, size: int) -> Array:
-    """A parameter as an array of that size, (size,), also where it is one number."""
-    return np.broadcast_to(numbers(values, name), size)
 
 
 def _waves(rate_hz: float, samples: Array) -> Array:

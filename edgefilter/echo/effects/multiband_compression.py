@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from edgefilter.echo.effect import Effect, Parameter, Runner, complete, neutral
+from edgefilter.echo.effect import Effect, Parameter, Runner, complete, neutral, numbers
 from edgefilter.echo.effects.compression import STEEPEST, Compressor
 from edgefilter.echo.effects.equaliser import MOST_DB
 from edgefilter.echo.effects.gain_fit import GainFit, Reach
@@ -93,8 +93,8 @@ class MultibandCompression(Effect):
 
     def sentence(self, values: Values) -> str:
         """The ratio of each band."""
-        low, high = np.broadcast_to(np.asarray(values["crossover_hz"], float), (2,))
-        ratios = ", ".join(f"{ratio:.1f}" for ratio in np.broadcast_to(np.asarray(values["ratio"], float), (BANDS,)))
+        low, high = numbers(values, "crossover_hz", 2)
+        ratios = ", ".join(f"{ratio:.1f}" for ratio in numbers(values, "ratio", BANDS))
         return (
             f"bands below {low:.0f} Hz, up to {high:.0f} Hz and above are each turned down when they have been loud, by"
             f" {ratios} to 1"
@@ -106,15 +106,13 @@ class BandCompressor:
 
     def __init__(self, values: Values, sample_rate: int) -> None:
         names = ("threshold_db", "ratio", "makeup_db")
-        each = [np.broadcast_to(np.asarray(values[name], float), (BANDS,)) for name in names]
+        each = [numbers(values, name, BANDS) for name in names]
         shared = {"attack_ms": values["attack_ms"], "release_ms": values["release_ms"], "knee_db": 6.0}
         self._compressors = [
-            Compressor({**dict(zip(names, numbers, strict=True)), **shared}, sample_rate)
-            for numbers in zip(*each, strict=True)
+            Compressor({**dict(zip(names, band, strict=True)), **shared}, sample_rate)
+            for band in zip(*each, strict=True)
         ]
-        self._crossovers = [
-            _Crossover(hz, sample_rate) for hz in np.broadcast_to(np.asarray(values["crossover_hz"], float), (2,))
-        ]
+        self._crossovers = [_Crossover(hz, sample_rate) for hz in numbers(values, "crossover_hz", 2)]
         self._idle = bool(np.all(each[1] == 1.0) and np.all(each[2] == 0.0))
 
     def __call__(self, x: Samples, heard: Samples | None = None) -> Samples:

@@ -65,7 +65,7 @@ class NoiseSuppression(Effect):
         return self.passed(x, x, values, sample_rate)
 
     def passed(self, noise: Samples, voice: Samples, values: Values, sample_rate: int) -> Samples:
-        gain_db = _gains(values)
+        gain_db = numbers(values, "gain_db", KNOTS_DB.size - 1)
         if not gain_db.any() or not noise.size:
             return noise.copy()
         density = 10.0 ** (numbers(values, "fan_db") / 10.0)
@@ -107,7 +107,7 @@ class NoiseSuppression(Effect):
         return within(self, {"gain_db": gain_db, "fan_db": fan_db, "softer_db": cells.quiet_db})
 
     def sentence(self, values: Values) -> str:
-        at = dict(zip(KNOTS_DB.astype(int).tolist(), _gains(values), strict=False))
+        at = dict(zip(KNOTS_DB.astype(int).tolist(), numbers(values, "gain_db", KNOTS_DB.size - 1), strict=False))
         return (
             f"while the robot is silent the fan is {-first(values, 'softer_db'):.0f} dB softer than calibrated, and of the"
             f" voice less is let through the less it stands out of the fan: {at[-5]:.0f} dB at -5 dB over it, {at[5]:.0f}"
@@ -148,11 +148,6 @@ class Cells:
         self.ratio_db, self.power, self.cross = (
             np.concatenate(parts) if parts else np.zeros(0) for parts in (ratio_db, power, cross)
         )
-
-
-def _gains(values: Values) -> Array:
-    """Gain in dB at each of KNOTS_DB but the last, (8,)."""
-    return np.broadcast_to(np.asarray(values["gain_db"], float), (KNOTS_DB.size - 1,))
 
 
 def _quiet_db(x: NDArray[np.complex128], y: NDArray[np.complex128]) -> float:
