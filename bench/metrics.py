@@ -19,7 +19,7 @@ from edgefilter.filter.barge_in import BargeIn, BargeInSettings
 from edgefilter.types import SAMPLE_RATE, Event, Samples
 
 if TYPE_CHECKING:
-    from bench.systems import Output
+    from bench.closed_loop import Output
 
 FRAME = SAMPLE_RATE // 50
 """20 ms: of levels over time."""

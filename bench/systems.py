@@ -1,8 +1,9 @@
 """The one catalogue of systems: what each does with a clip, what it knows, and why one cannot be had here.
 
 A row's name says how an engine runs: `crnn` with the clip's calibration, `crnn-learning` learns while it runs as well,
-`crnn-uncalibrated` and `crnn-uncalibrated-learning` know nothing beforehand. `crnn-listen`, and so on, is the same engine's
-sound for people. `-true-lag` behind a peer's name: its reference is delayed by the true lag, which no robot knows.
+`crnn-uncalibrated` and `crnn-uncalibrated-learning` know nothing beforehand. `crnn-listen`, and so on, is the same
+engine's sound for people. `crnn-uncalibrated-asked` lowers the robot's voice while somebody may speak. `-true-lag`
+behind a peer's name: its reference is delayed by the true lag, which no robot knows.
 """
 
 from __future__ import annotations
@@ -17,10 +18,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench import detectors, peers, results, voicefilter
+from bench import closed_loop, detectors, peers, results, voicefilter
+from bench.closed_loop import Output, recorded
 from bench.detectors import DETECTORS
 from bench.recordings import Clip, NotHere, Signals
-from edgefilter import EgoFilter, Event, PathLearner, Profile, calibrate
+from edgefilter import EgoFilter, PathLearner, Profile, calibrate
 from edgefilter.calibration.calibrate import FARTHEST
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.dsp.lag import correlation_near, flat_cross, highest, top
@@ -36,11 +38,15 @@ OWN = ("linear", "ss", "crnn")
 WAYS = {"": "calibrated", "-learning": "calibrated and learning", "-uncalibrated-learning": "learning only",
         "-uncalibrated": "uncalibrated"}  # fmt: skip
 LISTEN = "-listen"
+ASK_DB = 12.0
+"""By how much a robot that is asked lowers its voice, dB: about what people do when another begins to talk."""
 ARRAYS = (2, 3, 4)
 """Numbers of microphones, of conversations that have so many."""
 TRUE_LAG = "-true-lag"
 PEERS = {"speexdsp": "SpeexDSP", "speexdsp-suppressed": "SpeexDSP with its suppressor", "aec3": "WebRTC AEC3",
          "echoff": "echoff", "voiceclean": "voiceclean"}  # fmt: skip
+SPECIAL = ("detector", "listen", "asked")
+"""Kinds of rows that are taken only where they are named."""
 HEARD = ("unfiltered", "speexdsp-suppressed", "aec3", "crnn-uncalibrated")
 """Rows behind which a detector of speech can stand, as "ROW+DETECTOR" or "ROW+DETECTOR-held"."""
 ABSENT = {
@@ -55,23 +61,11 @@ NARROW = {"paper-crnn-narrow": ("", ""), BATCH_NORM: (", with batch normalisatio
 """Title and option of training of the paper's network with fewer filters and units: at full width that takes days."""
 
 
-class Output(NamedTuple):
-    """What a system made of a clip: samples (n,), aligned with it.
-
-    events, and the human's probability after each hop of so many samples; None where it does not tell who speaks.
-    """
-
-    samples: Samples
-    events: list[Event] | None = None
-    probability: list[float] | None = None
-    hop: int = 0
-
-
 @dataclass(frozen=True)
 class System:
     """A row.
 
-    kind: unfiltered, paper, own, listen, peer, bound or detector. knows: what it had besides microphone and reference. latency_ms: from
+    kind: unfiltered, paper, own, listen, asked, peer, bound or detector. knows: what it had besides microphone and reference. latency_ms: from
     its windows, None where it answers only at the end. missing: raises NotHere where it cannot run here. code: files
     and versions on which its output depends. model: a network that no engine brings.
     """
@@ -113,6 +107,7 @@ def catalogue(networks: Mapping[str, Path] | None = None) -> dict[str, System]:
     rows += [
         *_paper(),
         *(_own(engine, way) for way in WAYS for engine in (*OWN, f"crnn{LISTEN}")),
+        _asked(),
         *_arrays(),
         *_peers(),
     ]
@@ -131,12 +126,12 @@ def catalogue(networks: Mapping[str, Path] | None = None) -> dict[str, System]:
 
 
 def chosen(names: Sequence[str], networks: Mapping[str, Path] | None = None) -> list[System]:
-    """The rows of these names; without any, all but detectors and sounds for people. Raises UsageError for a name that no row has."""
+    """The rows of these names; without any, all but the SPECIAL. Raises UsageError for a name that no row has."""
     rows = catalogue(networks)
     for name in names:
         if name not in rows:
             raise UsageError(f"unknown system '{name}': choose some of {', '.join(rows)}")
-    return [one for one in rows.values() if one.name in names or (not names and one.kind not in ("detector", "listen"))]
+    return [one for one in rows.values() if one.name in names or (not names and one.kind not in SPECIAL)]
 
 
 def present(rows: Iterable[System]) -> tuple[list[System], dict[str, str]]:
@@ -155,15 +150,8 @@ def run_engine(
     wanted: Row, signals: Signals, profile: Profile | None, learner: Learner | None = None, model: Path | None = None
 ) -> Output:
     """An engine over mic and ref, hop by hop as live, so that its events and the probability after each hop are known."""
-    ego = EgoFilter(profile, engine=wanted.engine, model=model, learn=learner, output=wanted.sound)
-    parts, probability = [], []
-    for at in range(0, signals.ref.size, ego.hop):
-        parts.append(ego.process(signals.mic[at : at + ego.hop], signals.ref[at : at + ego.hop]))
-        probability.append(ego.speech_probability)
-    out = np.concatenate((*parts, ego.flush()))
-    if ego.speech_probability is None:
-        return Output(out)
-    return Output(out, ego.events(), [value or 0.0 for value in probability], ego.hop)
+    more = {"model": model, "learn": learner, "output": wanted.sound}
+    return closed_loop.listen(signals.mic, signals.ref, profile, wanted.engine, **more)
 
 
 def _own(engine: str, way: str, model: Path | None = None, name: str = "", title: str = "", train: str = "") -> System:
@@ -189,6 +177,21 @@ def _own(engine: str, way: str, model: Path | None = None, name: str = "", title
     late = None if engine == "paper-crnn" else _latency_ms(wanted.engine)  # whole clips
     code = partial(_engine_code, wanted.engine, model)
     return System(name or engine + way, title, kind, run, knows, late, missing, code, model)
+
+
+def _asked() -> System:
+    """The row of `crnn` without a calibration, on a real robot that lowers its voice where the filter asks for it."""
+
+    def run(clip: Clip) -> Output:
+        if clip.human is None and clip.talk != "farend":
+            raise NotHere("the robot alone is not known here")
+        robot = recorded(clip.mic if clip.human is None else clip.mic - clip.human, clip.ref, ASK_DB)
+        return closed_loop.listen(clip.mic, clip.ref, None, "crnn", robot)
+
+    title = "crnn, uncalibrated, asks the robot to lower its voice"
+    return System(
+        "crnn-uncalibrated-asked", title, "asked", run, "neither", _latency_ms("crnn"), code=partial(_engine_code, "crnn")
+    )
 
 
 def _arrays() -> list[System]:

@@ -25,14 +25,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import cycle, islice
 from pathlib import Path
-from typing import NamedTuple
 
 import jiwer
 import numpy as np
-import soundfile
 
 from bench import provenance, results
 from bench.cache import Cache
+from bench.closed_loop import Output, Robot, listen, recorded
 from bench.metrics import (
     IN_TIME_S,
     THRESHOLDS,
@@ -51,9 +50,6 @@ from bench.recogniser import Recogniser, normalise, word_errors
 from bench.recordings import CALIBRATION, find_recordings, progress
 from bench.simulate.conversations import Scene, make_scene, read_clips, read_voices
 from bench.simulate.robot_day import STARTS, Monologue, make_monologue
-from bench.systems import Output
-from edgefilter import EgoFilter
-from edgefilter.audio.fade import Fade
 from edgefilter.calibration.calibrate import calibrate
 from edgefilter.filter.barge_in import BargeIn, BargeInSettings
 from edgefilter.profile.data import Profile
@@ -86,40 +82,6 @@ POLICIES = {
     "alone": "the human alone, no fan, no robot",
 }
 SHORT = {"word": "a word of 0.3-0.5 s", "cough": "a cough"}
-
-
-class Robot(NamedTuple):
-    """A robot that lowers its voice by ask_db where the filter asks for it.
-
-    echo: of the microphone, (n,), what it says; late: samples by which that is later than in the reference. file: for what it
-    plays and its microphone hears, in stereo.
-    """
-
-    echo: Samples
-    late: int
-    ask_db: float
-    file: Path | None = None
-
-
-def listen(mic: Samples, ref: Samples, profile: Profile | None, engine: str, robot: Robot | None = None) -> Output:
-    """The filter over a recording, or in a closed loop with a robot that asks."""
-    ask_db = robot.ask_db if robot else 0.0
-    ego, probability, done = EgoFilter(profile, engine=engine, barge_in=BargeInSettings(ask_db=ask_db)), [], []
-    mic, ref = mic.astype(np.float32), ref.astype(np.float32)
-    fade, gains = Fade(), np.ones(mic.size, np.float32)
-    for at in range(0, mic.size, ego.hop):
-        block = slice(at, min(at + ego.hop, mic.size))
-        if robot:
-            fade.wanted = ego.voice_gain
-            gains[block] = fade.apply(gains[block], SAMPLE_RATE)
-            then = np.arange(block.start, block.stop) - robot.late
-            mic[block] += (np.where(then < 0, 1.0, gains[then]) - 1.0).astype(np.float32) * robot.echo[block]
-        done.append(ego.process(mic[block], gains[block] * ref[block]))
-        probability.append(ego.speech_probability)
-    if robot and robot.file:
-        soundfile.write(robot.file, np.stack((gains * ref, mic), axis=1), SAMPLE_RATE)
-    events = [event for event in ego.events() if event.kind.startswith(("speech", "voice"))]
-    return Output(np.concatenate((*done, ego.flush())), events, probability, ego.hop)
 
 
 def measure(scene: Scene, engine: str, recogniser: Recogniser | None, ask_db: float, file: Path | None = None) -> dict:
@@ -288,15 +250,6 @@ def real_minutes(folder: Path, engine: str, ask_db: float) -> list[dict]:
         robot = recorded(signals.mic, signals.ref, ask_db) if ask_db else None
         rows.append(row | stops(listen(signals.mic, signals.ref, None, engine, robot), speech_s))
     return rows
-
-
-def recorded(mic: Samples, ref: Samples, ask_db: float) -> Robot | None:
-    """A recorded robot, as late as the filter finds it in the end; None where it is not found."""
-    ego = EgoFilter(engine="linear")
-    ego.process(mic, ref)
-    found = ego.stats()["alignment"]
-    late = found["delay_samples"] if found else None
-    return None if late is None else Robot(mic, round(late), ask_db)
 
 
 def stops(talk: Output, speech_s: float) -> dict:

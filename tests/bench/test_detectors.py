@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from bench import devices, systems
+from bench.closed_loop import Output
 from bench.detectors import Detector, events, probabilities
 from bench.recordings import NotHere
-from bench.systems import Output
 
 QUARTER = Detector("Quarter", "numpy", 4000, lambda: lambda x: float(x[0]), 0.35)
 """A hop of a quarter of a second, whose first sample is the probability."""

@@ -289,6 +289,21 @@ def test_engines_that_tell_who_speaks_have_events_and_others_none(pairs: Path) -
     )
 
 
+def test_a_robot_that_is_asked_lowers_its_voice_by_what_is_asked(pairs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (clip,) = named([recorded_clip(one) for one in find_recordings(pairs) if one.name == "device1_00"], "alone")
+    row = systems.catalogue()["crnn-uncalibrated-asked"]
+    asked = []
+    monkeypatch.setattr(systems.closed_loop, "listen", lambda *given: asked.append(given) or systems.Output(clip.mic))
+    row.run(clip)
+    robot = asked[0][-1]
+    assert np.array_equal(robot.echo, clip.mic) and robot.ask_db == systems.ASK_DB
+    human = clip.mic * np.float32(0.25)
+    clip.signals = clip.signals._replace(human=human)
+    row.run(clip)
+    assert np.array_equal(asked[1][-1].echo, clip.mic - human)
+    assert row.name not in [one.name for one in systems.chosen([])]
+
+
 def test_the_sound_for_people_is_a_row_of_its_own_for_who_asks(pairs: Path) -> None:
     (clip,) = named([recorded_clip(one) for one in find_recordings(pairs) if one.name == "device1_00"], "alone")
     known = systems.catalogue()

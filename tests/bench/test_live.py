@@ -12,6 +12,8 @@ import pytest
 import soundfile
 
 from bench import __main__ as bench
+from bench import closed_loop
+from bench.closed_loop import Output
 from bench.live import barge_in, click, soak, trial
 from bench.live.barge_in import early_errors, lasts, lowered, muted, silent_at, words
 from bench.metrics import first_sound
@@ -19,7 +21,6 @@ from bench.recogniser import Recogniser
 from bench.simulate import robot_day
 from bench.simulate.conversations import Scene, make_scene, read_clips, read_voices
 from bench.simulate.simulated_robot import Room, draw_robot, draw_walls, stand
-from bench.systems import Output
 from edgefilter import Event
 from tests.bench.conftest import RATE, babble
 from tests.program import DEMO
@@ -274,9 +275,9 @@ def test_speech_lasts_until_a_pause_of_a_fifth_of_a_second() -> None:
 
 def test_a_recorded_robot_is_lowered_as_late_as_it_is_found() -> None:
     mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0][: 7 * RATE] for name in ("mic", "reference"))
-    robot = barge_in.recorded(mic, ref, 12.0)
+    robot = closed_loop.recorded(mic, ref, 12.0)
     assert robot is not None and robot.late == pytest.approx(2288, abs=48) and robot.ask_db == 12.0
-    assert barge_in.recorded(mic[::-1].copy(), ref, 12.0) is None
+    assert closed_loop.recorded(mic[::-1].copy(), ref, 12.0) is None
 
 
 @pytest.mark.slow
@@ -350,9 +351,9 @@ def test_a_robot_that_asks_is_heard_lower_as_late_as_its_sound_comes(
         def flush(self) -> np.ndarray:
             return np.zeros(0, np.float32)
 
-    monkeypatch.setattr(barge_in, "EgoFilter", Asking)
+    monkeypatch.setattr(closed_loop, "EgoFilter", Asking)
     ones, late = np.ones(50 * 256, np.float32), 5 * 256
-    barge_in.listen(1.5 * ones, ones, None, "crnn", barge_in.Robot(ones, late, 12.0, tmp_path / "it.wav"))
+    closed_loop.listen(1.5 * ones, ones, None, "crnn", closed_loop.Robot(ones, late, 12.0, tmp_path / "it.wav"))
     mic, ref = (np.concatenate(part) for part in zip(*heard))
     written, _ = soundfile.read(tmp_path / "it.wav")
     np.testing.assert_allclose(written, np.clip(np.stack((ref, mic), axis=1), -1.0, 1.0), atol=1e-4)

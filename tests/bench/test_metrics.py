@@ -11,9 +11,9 @@ import pytest
 
 from bench import metrics
 from bench.cache import Cache
+from bench.closed_loop import Output
 from bench.metrics import difference, excess_db, first_sound, in_time, mean, noticed, pooled, replay
 from bench.recogniser import Recogniser, WordErrors, normalise, word_errors
-from bench.systems import Output
 from edgefilter.errors import UsageError
 from edgefilter.types import Event
 from tests.bench.conftest import RATE, babble, bursts, clip_of

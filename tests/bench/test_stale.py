@@ -15,7 +15,7 @@ import pytest
 from bench import __main__ as program
 from bench import provenance, results, stale, systems
 from bench.cache import Cache
-from bench.systems import Output
+from bench.closed_loop import Output
 
 
 def test_a_result_is_stale_where_a_system_gives_another_sound(
