@@ -200,7 +200,7 @@ class BargeIn:
         """Take the probability of a hop, None where the engine does not judge it.
 
         wait: hops for which speech that has begun is not told yet, nor suspected; if it has ended by then it never is.
-        Where that is over before its time, the robot is found: the sum then begins anew, as where the robot has lowered its voice.
+        If the wait falls to 0 because the robot's lag was found, the evidence is summed anew, as once a lowered voice is heard.
         heard_after: hops after which a voice that is lowered now would be heard lower; 0 where it cannot be lowered.
         robot: whether the robot's voice is heard, so that the hop teaches how often it is taken for a human.
         """
