@@ -1,4 +1,4 @@
-"""The filter over a recording, hop by hop as live, and in a closed loop with a robot that lowers its voice where the filter asks for it."""
+"""Run the filter over a recording hop by hop, as live; the recorded robot may lower its voice when the filter asks for it (closed loop)."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from edgefilter.types import SAMPLE_RATE, Samples
 
 
 class Output(NamedTuple):
-    """What a system made of a clip: samples (n,), aligned with it.
+    """What a system made of a clip.
 
-    events, and the human's probability after each hop of so many samples; None where it does not tell who speaks.
+    samples: (n,), aligned with the clip. events, probability: what it said, and how likely it found a human after each hop (hop
+    samples); None for a system that does not judge who speaks.
     """
 
     samples: Samples
@@ -27,10 +28,10 @@ class Output(NamedTuple):
 
 
 class Robot(NamedTuple):
-    """A robot that lowers its voice by ask_db where the filter asks for it.
+    """A robot that lowers its voice by ask_db when the filter asks for it.
 
-    echo: of the microphone, (n,), what it says; late: samples by which that is later than in the reference. file: for what it
-    plays and its microphone hears, in stereo.
+    echo: (n,), its voice as the microphone recorded it; late: delay of the echo behind the reference, samples. file: where to
+    write what it plays (left) and what its microphone hears (right).
     """
 
     echo: Samples
@@ -42,7 +43,7 @@ class Robot(NamedTuple):
 def listen(
     mic: Samples, ref: Samples, profile: Profile | None, engine: str, robot: Robot | None = None, **more: Any
 ) -> Output:
-    """What the filter makes of mic (n,) or (n, microphones) and ref (n,); more: as of EgoFilter."""
+    """Run the filter over mic (n,) or (n, microphones) and ref (n,); more: further arguments of EgoFilter."""
     ego = EgoFilter(profile, engine=engine, barge_in=BargeInSettings(ask_db=robot.ask_db) if robot else None, **more)
     mic, ref = mic.astype(np.float32), ref.astype(np.float32)
     fade, gains, done, probability = Fade(), np.ones(ref.size, np.float32), [], []
@@ -64,7 +65,7 @@ def listen(
 
 
 def recorded(mic: Samples, ref: Samples, ask_db: float) -> Robot | None:
-    """A robot that was recorded alone, with all that its recording mic holds, as late as the filter finds it; None where it does not."""
+    """A robot that was recorded alone: all of the recording mic (n,) counts as its echo; None where the filter does not find its lag."""
     ego = EgoFilter(engine="linear")
     ego.process(mic, ref)
     found = ego.stats()["alignment"]

@@ -2,7 +2,7 @@
 
 A row's name says how an engine runs: `crnn` with the clip's calibration, `crnn-learning` learns while it runs as well,
 `crnn-uncalibrated` and `crnn-uncalibrated-learning` know nothing beforehand. `crnn-listen`, and so on, is the same
-engine's sound for people. `crnn-uncalibrated-asked` lowers the robot's voice while somebody may speak. `-true-lag`
+engine's sound for people. In `crnn-uncalibrated-asked` the robot lowers its voice while somebody may speak. `-true-lag`
 behind a peer's name: its reference is delayed by the true lag, which no robot knows.
 """
 
@@ -39,7 +39,7 @@ WAYS = {"": "calibrated", "-learning": "calibrated and learning", "-uncalibrated
         "-uncalibrated": "uncalibrated"}  # fmt: skip
 LISTEN = "-listen"
 ASK_DB = 12.0
-"""By how much a robot that is asked lowers its voice, dB: about what people do when another begins to talk."""
+"""By how much the robot lowers its voice when the filter asks for it, dB: about as much as people do when another begins to talk."""
 ARRAYS = (2, 3, 4)
 """Numbers of microphones, of conversations that have so many."""
 TRUE_LAG = "-true-lag"
@@ -190,7 +190,13 @@ def _asked() -> System:
 
     title = "crnn, uncalibrated, asks the robot to lower its voice"
     return System(
-        "crnn-uncalibrated-asked", title, "asked", run, "neither", _latency_ms("crnn"), code=partial(_engine_code, "crnn")
+        "crnn-uncalibrated-asked",
+        title,
+        "asked",
+        run,
+        "neither",
+        _latency_ms("crnn"),
+        code=partial(_engine_code, "crnn"),
     )
 
 

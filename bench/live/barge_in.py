@@ -238,7 +238,7 @@ def monologue(made: Monologue, engine: str, ask_db: float) -> dict:
 
 
 def real_minutes(folder: Path, engine: str, ask_db: float) -> list[dict]:
-    """A row for each recording of a robot alone that nothing was tuned on; where it asks, all that is recorded falls."""
+    """A row for each recording of a robot alone that nothing was tuned on. While the filter asks, the whole recording is lowered."""
     rows = []
     for recording in progress([r for r in find_recordings(folder) if r.kind == "farend" and not r.tuned_on]):
         signals = recording.signals()

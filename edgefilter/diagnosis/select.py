@@ -110,7 +110,7 @@ def _exchange(bench: Workbench, start: EchoModel, model: EchoModel, name: str) -
 
 
 def split(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
-    """The model with a simpler effect beside each one whose fit has taken that up as well."""
+    """The model in which each effect that has imitated a simpler one as well is replaced by both."""
     for name in added(start, model):
         apart = _apart(bench, model, name)
         if apart is not model and standing(bench, start, apart) is apart:
@@ -119,7 +119,7 @@ def split(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
 
 
 def _apart(bench: Workbench, model: EchoModel, name: str) -> EchoModel:
-    """The model with a simpler effect beside the one of that name, where its fit has taken that one up as well; or as it is."""
+    """The model with a simpler effect beside the effect `name`, if that one's fit has imitated it as well; otherwise as it is."""
     effect, values, others = find(name), dict(model.effects)[name], bench.less(model, name)
     only = effect.only(values)
     if only is values:

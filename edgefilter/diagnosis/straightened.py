@@ -139,7 +139,10 @@ class Straightened:
         return self._behind[key]
 
     def fitted(self, name: str, model: EchoModel) -> dict[str, float | Array]:
-        """All values of an effect that a model has not, in the noise that this expects; of one ahead of a drift without the drift."""
+        """Fit an effect that the model lacks, against the noise that the model expects; all its values.
+
+        An effect that comes before a clock drift is fitted to the recording without the drift.
+        """
         here = self.behind(model)
         if model.still is model or STAGES.index(find(name).stage) >= STAGES.index("time"):
             return model.fitted(name, here.measurement)
@@ -152,7 +155,7 @@ class Straightened:
         """The measurement with its recording as it was ahead of what read its samples there, (n,)."""
         n = np.arange(read.size)
         at = np.interp(n, read, n)
-        # at twice the rate, where the filter that reads between samples passes all of the band
+        # at twice the sampling rate, at which the interpolation filter passes the whole band
         spectrum = fft.rfft(np.pad(self.measurement.recording, (0, SPAN)))
         twice = fft.irfft(2.0 * spectrum, 2 * (n.size + SPAN))[: 2 * n.size].astype(np.float32)
         moved, fit = interpolate(twice, 2.0 * at), self.fit[np.rint(at).astype(int)]

@@ -216,16 +216,19 @@ class Workbench:
         return share_of(self.score(model).active_db, trial.score.active_db) > self.criteria.half
 
     def attempt_simpler(self, name: str, model: EchoModel, rigid: bool = False) -> list[Trial]:
-        """Each effect of that one's family that is simpler; rigid: only of few numbers. Of two flexible ones either may be in the other."""
+        """Try each simpler effect of the family of the effect `name`.
+
+        rigid: leave out those with many free numbers, since either of two such effects can imitate the other.
+        """
         rich, known = find(name), [find(other) for other in self.absent(model)]
         simpler = [one for one in known if one.family == rich.family and one.complexity < rich.complexity]
         return self._attempt_in_turn([one.name for one in simpler if not (rigid and one.flexible)], model)
 
     def attempt_all(self, model: EchoModel) -> list[Trial]:
-        """Each effect that the model has not.
+        """Try each effect that the model lacks.
 
-        Where none of them explains a good part of what is left, a nonlinear loudspeaker with a filter ahead of it; the last
-        resorts only where that does not either.
+        If none of them explains a good part of the residual, a nonlinear loudspeaker with a filter ahead of it is tried; if that
+        does not either, the last resorts.
         """
         absent = self.absent(model)
         found = self._attempt_in_turn([name for name in absent if not find(name).last_resort], model)
@@ -310,7 +313,7 @@ class Workbench:
         return not (by_chance or taken_up)
 
     def absent(self, model: EchoModel) -> list[str]:
-        """Names of the effects that a model has not, or as the start has them, and that may be tried."""
+        """Names of the effects that may be tried: those that the model lacks, or still has with the values of the start."""
         out = {*added(self._start, model), *self._without}
         return [name for name in names() if name not in out and not find(name).free]
 

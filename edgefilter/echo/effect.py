@@ -98,7 +98,7 @@ class Effect:
         return x.copy()
 
     def read_at(self, values: Values, size: int, sample_rate: int) -> Array:
-        """Of an effect of stage "time" that only moves sound: the position in x from which each sample behind it comes, (size,), rising."""
+        """For an effect of stage "time" that only shifts sound in time: where in x each of its output samples is read, (size,), rising."""
         return np.arange(float(size))
 
     def run(self, values: Values, sample_rate: int) -> Runner | None:
@@ -249,6 +249,6 @@ def first(values: Values, name: str) -> float:
 
 
 def numbers(values: Values, name: str, size: int | None = None) -> Array:
-    """A parameter as an array, also where it is one number, (k,) float64; with a size as one of that size, not to be written to."""
+    """A parameter, one number or several, as an array (k,) float64; with `size` a single number is repeated (read-only) to (size,)."""
     found = np.atleast_1d(np.asarray(values[name], float))
     return found if size is None else np.broadcast_to(found, size)

@@ -140,7 +140,7 @@ class Spectra:
 
 
 def spectra(measurement: Measurement, model: VoiceModel, resolution_hz: float) -> Spectra:
-    """Auto- and cross-spectra of a model's whitened prediction and the recording over the fit samples, averaged to resolution_hz."""
+    """Auto- and cross-spectra of a model's whitened prediction and the recording over the fit samples, averaged over bands of resolution_hz."""
     n = _transformed(measurement.recording.size)
     whole = measurement.once(_spectra, model)
     width = max(int(resolution_hz * n / SAMPLE_RATE), 1)
@@ -155,7 +155,7 @@ def _transformed(size: int) -> int:
 
 
 def _spectra(measurement: Measurement, model: VoiceModel) -> tuple[Array, NDArray[np.complex128], Array]:
-    """Power of the prediction, cross-spectrum, and power of the recording in each bin, of the whitened fit samples."""
+    """In each bin, of the whitened fit samples: power of the prediction, cross-spectrum, power of the recording."""
     signals = measurement.predicted(model)[1], measurement.white_recording
     n = _transformed(signals[0].size)
     a, b = (fft.rfft((x * measurement.weights).astype(np.float64), n) for x in signals)

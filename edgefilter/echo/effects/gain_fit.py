@@ -18,7 +18,7 @@ from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 EXCERPT = 8 * SAMPLE_RATE
 """Samples of the stretch that is fitted."""
 STEP = 16
-"""Samples (1 ms) from one value of a level, or of a gain by time, to the next."""
+"""Samples (1 ms) between two values of a level, or of a gain over time."""
 TAPS = 8
 """Of the nuisance filter on each part of the prediction, half of them ahead: what is linear, the make-up gain included."""
 SETTLED = 1e-3
@@ -43,7 +43,7 @@ class Reach:
     def solved(
         self, residual: Callable[[Array], Array], slopes: Callable[[Array], Array], start: Array
     ) -> tuple[Array, float]:
-        """The unknowns that leave least of a residual, by its slopes, and the energy that they leave."""
+        """Solve for the unknowns with the smallest residual, given its derivatives (slopes); the unknowns, and the energy of what they leave."""
         edge = 1e-3 * self.nudge  # the solver begins inside of its bounds
         start, bounds = np.clip(start, self.lowest + edge, self.highest - edge), (self.lowest, self.highest)
         found = scipy.optimize.least_squares(residual, start, slopes, bounds, x_scale=self.nudge, ftol=SETTLED)
@@ -76,7 +76,7 @@ class GainFit:
         self.without, self._heard_plain = float(left @ left), self._target - left
 
     def best(self, starts: Sequence[Array]) -> tuple[Array, float] | None:
-        """The unknowns that leave least, and that energy; None where they do not pay for themselves by Bayes' criterion (Schwarz 1978)."""
+        """The unknowns with the smallest residual, and its energy; None if they lower it by less than Bayes' criterion asks (Schwarz 1978)."""
         reach = self._reach
         starts = [np.clip(start, reach.lowest, reach.highest) for start in starts]
         costs = [self.cost(start) for start in starts]
@@ -88,9 +88,10 @@ class GainFit:
         return (best, cost) if self.without - cost > worth else None
 
     def roughly(self, gain: Callable[[Array], Array], starts: Sequence[Array]) -> list[Array]:
-        """The best of some starts, and what least squares make of it, by the gain (steps,) in each STEP that unknowns are.
+        """The best of some starts, and the same after a quick least-squares fit of one gain per STEP; gain(unknowns): (steps,).
 
-        As if what is heard in one were what was said in it, through the one filter that is best without a gain.
+        Quick, since the echo path is kept at the filter that fits best without any gain, and each STEP of sound is taken to arrive
+        within itself.
         """
         pairs = self._heard_plain**2, self._heard_plain * self._target
         whole = np.zeros((2, self.x.size + PRE_ROLL))
@@ -112,7 +113,7 @@ class GainFit:
         return [best, self._reach.solved(left, slopes, best)[0]]
 
     def cost(self, unknowns: Array) -> float:
-        """Energy that these unknowns leave of the excerpt."""
+        """Energy of the residual with these unknowns, over the excerpt."""
         left = self._residual(unknowns)
         return float(left @ left)
 
@@ -128,7 +129,7 @@ class GainFit:
         return self._left(self._make(self.x, unknowns))
 
     def _slopes(self, unknowns: Array) -> Array:
-        """Derivatives of the residual, (chosen, k), the filters taken to move what is explained, not how (Kaufman 1975)."""
+        """Derivatives of the residual, (chosen, k), with those of the filters approximated as Kaufman (1975) does."""
         sounds = self._make(self.x, unknowns)
         rows = self._rows(sounds)
         gains = self._weights(rows, self._target).reshape(len(sounds), TAPS).sum(axis=1)
@@ -138,7 +139,7 @@ class GainFit:
         return rows @ self._weights(rows, moved) - moved
 
     def _left(self, sounds: Sequence[Samples]) -> Samples:
-        """What the sounds, each through the filter of TAPS that is best, leave of the excerpt, (chosen,)."""
+        """Residual of the excerpt after the sounds, each through its best filter of TAPS taps, (chosen,)."""
         rows = self._rows(sounds)
         return self._target - rows @ self._weights(rows, self._target)
 
@@ -165,9 +166,10 @@ def fit_one(
     starts: Iterable[Sequence[float]],
     by_peaks: bool = False,
 ) -> Values:
-    """Values of an effect with make-up gain from the best of some starts, in unknowns, the level re the loudest 20 ms; neutral where none pays.
+    """Fit an effect with make-up gain: the values of the best start after least squares, or neutral ones if none is worth its numbers.
 
-    by_peaks: whether it hears these rather than the mean square.
+    starts: of the unknowns; the first is a level in dB above the loudest 20 ms. by_peaks: whether the effect follows the peaks
+    rather than the mean square.
     """
 
     def turned(x: Samples, unknowns: Array, sample_rate: int = SAMPLE_RATE) -> tuple[Samples]:
@@ -188,13 +190,13 @@ def fit_one(
 
 
 def excerpt(measurement: Measurement, model: VoiceModel, size: int) -> slice:
-    """The loudest stretch of so many samples of the reference, or the first one where the model knows what time it is."""
+    """The loudest `size` samples of the reference; the first `size` if an effect of the model depends on the time of the recording."""
     fitted = measurement.weights > 0.0
     return slice(0, size) if model.timed else loudest(measurement.reference, fitted, size)
 
 
 def loudest(x: Samples, fitted: NDArray[np.bool_], size: int) -> slice:
-    """The loudest stretch of so many samples of x (n,), of those of which about as much may be fitted to as of any."""
+    """The loudest `size` samples of x (n,) among the stretches with at least half as many samples to fit to as the best one."""
     if x.size <= size:
         return slice(0, x.size)
     sums = (np.cumsum(np.pad(each, (1, 0)), dtype=np.float64) for each in (np.square(x), fitted))

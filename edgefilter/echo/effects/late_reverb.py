@@ -105,7 +105,7 @@ def fit_path(measurement: Measurement, model: VoiceModel) -> tuple[Array, float,
     rt60 = reverberation_time(after(taps)) or reverberation_time(before[direct:])
     if rt60 > 0.0:
         expected, noise = decaying(taps, SLOWER * rt60), block_energy(taps)[1] / BLOCK
-        known = taps * expected / (expected + noise + 1e-30)  # as if one tap's error said nothing of another's
+        known = taps * expected / (expected + noise + 1e-30)  # the errors of the taps are taken to be independent
         taps = fit_filter(x, residual, measurement.weights, length, 0, expected, steps=20, start=known)
     return scale * taps, rt60, centre_time(after(taps)) > LONGER * centre_time(before[direct:])
 

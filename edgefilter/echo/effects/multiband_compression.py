@@ -150,7 +150,7 @@ def find_crossovers(found: Spectra) -> tuple[float, float, float] | None:
     turned = np.concatenate((turned.real, turned.imag))
 
     def explained(bands: NDArray[np.complex128]) -> Array:
-        """Of several bands (pairs, BANDS, m) what they explain at each delay, (pairs, delays); not where one is turned over."""
+        """Energy that these bands (pairs, BANDS, m) explain at each delay, (pairs, delays); -inf if a band would need a negative gain."""
         both = np.concatenate((bands.real, bands.imag), axis=2)
         matrix = both * np.tile(found.predicted, 2) @ both.swapaxes(1, 2)
         right = both @ turned

@@ -69,9 +69,7 @@ class PathChange(Effect):
             time = start / SAMPLE_RATE
             if explained[start] > 0.0:
                 return neutral(self)
-        first = max(
-            int((time - 1.2) * SAMPLE_RATE), 0
-        )  # before this second and after it none of the fades that are tried differ
+        first = max(int((time - 1.2) * SAMPLE_RATE), 0)  # outside of these seconds all fades that are tried are equal
         part = slice(first, int((time + 1.2) * SAMPLE_RATE))
         around, turned, begin = residual[part], change[part], first / SAMPLE_RATE
         errors = {}
