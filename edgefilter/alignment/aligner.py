@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edgefilter.alignment.belief import SAME, Belief, believed
+from edgefilter.alignment.belief import LOOK, Belief, believed
 from edgefilter.alignment.coarse_lag import CoarseLag
 from edgefilter.alignment.delay_line import HALF_WIDTH, WAIT, DelayBuffer, kernel_table, read_delayed, read_line
 from edgefilter.alignment.delay_tracker import DRIFTED, FAINT, SIZE, STRIDE, DelayMeasurement, DelayMeter, DriftFilter
-from edgefilter.alignment.lag_search import ALIKE, CERTAIN, EVEN, MINIMUM, MOST_LAG_S, REFLECTIONS, Found, LagSearch
+from edgefilter.alignment.lag_search import ALIKE, CERTAIN, EVEN, MINIMUM, MOST_LAG_S, SAME, Found, LagSearch
 from edgefilter.alignment.utterances import AHEAD, Announcements, FirstSounds, OnsetDetector, Playback, Utterance
 from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, AlignmentCounts, AlignmentState, AlignmentStats, Samples
@@ -25,11 +25,11 @@ LIKELY_LAG_S = 2.0
 """Lag of the playback up to which an utterance is waited for: one that is heard later is rarer than a loudspeaker that is muted."""
 LATE = SAMPLE_RATE // 10
 """Samples by which a reference may come after its echo and is still found for an utterance; with LATEST they are found .15 s later."""
-LATEST, FURTHEST, STRETCH = 2 * SAMPLE_RATE, 5 * SAMPLE_RATE, 3 * SAMPLE_RATE
-"""Of a look, a search that supposes no beginning of an utterance: samples by which the reference may come after its echo, the longest
-lag, which is told but not followed, and samples of the microphone, of which a second is compared even at that lateness."""
-LOOKS, FIRST_LOOK, NEXT_LOOK = 12, SAMPLE_RATE // 2, SAMPLE_RATE
-"""Looks that are remembered, samples of an utterance after which there is one, and from one to the next; one more at each realignment.
+LATEST, FURTHEST = 2 * SAMPLE_RATE, 5 * SAMPLE_RATE
+"""Of a look, a search that supposes no beginning of an utterance: samples by which the reference may come after its echo, and the longest
+lag, which is told but not followed. Of the microphone a LOOK is compared even at that lateness."""
+LOOKS, FIRST_LOOK = 12, SAMPLE_RATE // 2
+"""Looks that are remembered, and samples of an utterance after which there is one; each LOOK another, and one more at each realignment.
 Speech that begins while the reference is silent waits for as long until it is nobody's but a human's: the reference may follow."""
 SEARCH_STRIDE = 768
 """Samples between two searches of the whole range."""
@@ -103,7 +103,7 @@ class Aligner:
 
     def __init__(self, hop: int, profile: Profile | None = None, max_lag_s: float = MOST_LAG_S) -> None:
         self.hop = hop
-        self._max_lag = int((max_lag_s + 0.1) * SAMPLE_RATE)
+        self._max_lag = int(max_lag_s * SAMPLE_RATE)
         # samples from the beginning of an utterance until it is heard, most likely and at most
         self._likely, self._latest = (int((s + 0.35) * SAMPLE_RATE) for s in (min(max_lag_s, LIKELY_LAG_S), max_lag_s))
         self._calibrated = None if profile is None else list(profile.running_responses())
@@ -114,8 +114,7 @@ class Aligner:
     def _listen_for(self, responses: Sequence[Samples] | None) -> None:
         """What an arrival looks like from now on: the microphones' impulse responses (taps,); None: anything."""
         self._responses = responses
-        early = [one[: PRE_ROLL + REFLECTIONS] for one in responses or ()]
-        self._lags = LagSearch(self._max_lag, early, LATE, (FURTHEST, LATEST, STRETCH))
+        self._lags = LagSearch(self._max_lag, responses or (), LATE, (FURTHEST, LATEST, LATEST + LOOK))
         self._meter = DelayMeter(None if responses is None else responses[self._used[0]])
 
     def reset(self) -> None:
@@ -201,7 +200,7 @@ class Aligner:
             if not aligned.realigned and now < self._next_look:
                 return None
             sure = CERTAIN / (CERTAIN + 1.0) if aligned.state == "coarse" else aligned.confidence
-            seen, self._next_look = Found.followed(round(aligned.delay), sure, now), now + NEXT_LOOK
+            seen, self._next_look = Found.followed(round(aligned.delay), sure, now), now + LOOK
         if seen is None:
             return None
         self._looks.append(seen)
@@ -311,7 +310,7 @@ class Aligner:
             heard = now - self._onsets.current.end <= FURTHEST  # as long as it may be, however late
             due = heard and now >= self._next_look and not self._follows(self._state())
             if due:
-                self._next_look += NEXT_LOOK
+                self._next_look += LOOK
             elif self._to_search > 0:
                 return False
             self._steps = self._look_anywhere() if due else self._look_for_utterance()
@@ -365,7 +364,8 @@ class Aligner:
                 yield self._take(found)
                 return
             yield False
-            alike = self._responses is not None or self._known or self._coarse
+            # where samples are missing the windows before were heard at other lags
+            alike = self._responses is not None or self._coarse or self._belief.lossy > 1.0
             if not found.old or found.odds <= (CERTAIN * ALIKE if alike else 1.0 / CERTAIN) or (alike and looked_back):
                 return
             first, looked_back = self._used[0], True
@@ -381,7 +381,7 @@ class Aligner:
         self._resolve()
         if self._known and abs(found.lag - self._drift.delay) < 24:
             return was_refuted
-        return self._switch(float(found.lag), 3.0)
+        return self._switch(float(found.lag))
 
     def _begin(self, heard_at: int) -> bool:
         """What was announced is heard since heard_at: from now on it is the reference."""
@@ -389,14 +389,14 @@ class Aligner:
         self._counts["announced_heard"] += 1
         self._ref.rewrite(playback.start, playback.read(playback.start, now))
         self._onsets.current = Utterance(playback.start, now)
-        return self._switch(float(AHEAD), 3.0)
+        return self._switch(float(AHEAD))
 
-    def _switch(self, delay: float, deviation: float) -> bool:
+    def _switch(self, delay: float) -> bool:
         if self._coarse and not math.isnan(self._read_at):  # the canceller has learned what arrives behind that lag
             self._margin = max(round(delay - self._read_at), PRE_ROLL)
             self._meter = DelayMeter()  # the other has learned what arrives around the coarse lag
             self._gain = None
-        self._drift.restart(delay, deviation)
+        self._drift.restart(delay, 3.0)
         return self._switched()
 
     def _switched(self) -> bool:

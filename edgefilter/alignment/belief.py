@@ -11,19 +11,27 @@ import numpy as np
 from scipy.special import expit
 
 from edgefilter.alignment.delay_line import WAIT, DelayBuffer
-from edgefilter.alignment.lag_search import CERTAIN, EARLY_ODDS, MISSED, MOST_LAG_S, NEAR, REFLECTIONS, Found, LagSearch
+from edgefilter.alignment.lag_search import (
+    CERTAIN,
+    EARLY_ODDS,
+    MISSED,
+    MOST_LAG_S,
+    NEAR,
+    REFLECTIONS,
+    SAME,
+    Found,
+    LagSearch,
+)
 from edgefilter.dsp.frames import decibels, stretch
 from edgefilter.dsp.lag import correlation_near, flat_cross, highest
 from edgefilter.errors import SignalError
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 REACH = round(MOST_LAG_S * SAMPLE_RATE)
-"""Largest lag in samples, of either sign; a running filter follows lags up to .1 s longer."""
+"""Largest lag in samples, of either sign; a running filter follows none that is longer."""
 LOOK = SAMPLE_RATE
 """Samples of the recording in one look: clocks 300 ppm apart move the lag by 5 of them meanwhile. Of 23 real recordings with an echo it
 is found in all; with looks of 2 s not in two whose lag changes faster, or whose microphone is processed."""
-SAME = 32
-"""Samples by which the lags of two looks may differ and be one lag: what clocks and a person who walks move it by."""
 JUMP = 0.2
 """Probability that from one look to the next the lag is another: utterances last some 5 s, and each may have its own."""
 CLEAR_DB, LEADS = 0.5, 80
@@ -133,7 +141,7 @@ def believed(looks: Sequence[Found]) -> Belief:
     anew, late = np.ones(seen.shape[1]), np.full(seen.shape[1], EARLY_ODDS / (1.0 + EARLY_ODDS))
     anew[state], late[state] = [look.prior / cells for look in looks], lags < -WAIT
     beyond = np.zeros(seen.shape[1])
-    beyond[state] = lags > REACH + SAMPLE_RATE // 10
+    beyond[state] = lags > REACH
     before, evidence = _after(seen, anew)
     known = before * _after(seen[::-1], anew)[0][::-1] / (seen * anew)
     known = expit(evidence) * known / known.sum(axis=1, keepdims=True)

@@ -28,15 +28,13 @@ EARLY = (48, 400)
 """Samples before and after the direct sound that the learnt response keeps."""
 SMALL = 8.0
 """Samples of a jump up to which it may also be a wrong slope, and is half as likely as to any other lag within REACH."""
-CHANCE, FAR = 2.47, 1000.0
-"""Evidence by which a jump gets e times as likely, and by how much one beyond REACH is less likely than one within. In 7 minutes of human
+CHANCE = 2.47
+"""Evidence by which a jump gets e times as likely; one beyond REACH is less likely than one within by CERTAIN twice. In 7 minutes of human
 speech while the reference played unheard, looks that agree had up to 19 within REACH and 29 beyond, with exponential tails: a jump
-that is certain, of 30 or 50, comes about once in 100 hours of such speech, and beyond REACH once in 5 if all looks went that far."""
+that is certain, of 30 or 56, comes about once in 100 hours of such speech, and beyond REACH once in 50 if all looks went that far."""
 ONE_LOOK = math.log(CERTAIN * 2 * REACH)
 """Logarithm of the likelihood ratio that one look shows at most, with which a jump within REACH is as good as certain: what is heard in an
 eighth of a second through a microphone that is processed may agree with the reference at any delay."""
-AGREE = 0.7
-"""Samples within which two looks see the same jump."""
 FORGET = 0.7
 """What is left of a suspicion after a look that saw another jump."""
 HEARD = 6.0
@@ -45,14 +43,13 @@ FAINT, STRANGE, EDGE = 0.25, 10.0, 64
 """Lower and upper limit of the microphone's power over the expected echo's, outside of which no jump can be measured, and samples
 at each end of the range in which none is believed."""
 DRIFTED = 1.5
-"""Samples of a sudden error up to which it is put down to the drift: buffers that are lost or repeated have more."""
-EXPECTED, UNEXPECTED, TINY = 3.0, 5.0, 0.3
+"""Samples of a sudden error up to which it is put down to the drift, buffers that are lost or repeated have more, and within which
+two looks see the same jump."""
+EXPECTED, UNEXPECTED = 3.0, 5.0
 """Surprise, in standard deviations, up to which an error of up to SMALL samples is drift, and one of up to DRIFTED, and from
-which on a look contradicts what is believed; samples of error that are drift whatever the surprise."""
+which on a look contradicts what is believed."""
 SLOPE_DEVIATION = 150e-6
-"""Standard deviation of two clocks' difference before anything is known, samples per sample."""
-STEEPEST = 600e-6
-"""Slope that is never exceeded; clocks differ by half of it."""
+"""Standard deviation of two clocks' difference before anything is known, samples per sample; it never exceeds UNEXPECTED of them."""
 BIAS = 0.1
 """Samples by which looks err alike where the response that is supposed explains nothing of the microphone."""
 
@@ -264,7 +261,7 @@ class DriftFilter:
     def step(self, offset: float, deviation: float) -> None:
         """The delay is another one by an offset; a small one may come from a wrong slope since the last look as well as from a jump."""
         wrong = offset / max(self._since, STRIDE)
-        if abs(offset) <= SMALL and abs(self.slope + wrong) < STEEPEST:
+        if abs(offset) <= SMALL and abs(self.slope + wrong) < UNEXPECTED * SLOPE_DEVIATION:
             self._slope_variance = min(self._slope_variance + wrong**2, SLOPE_DEVIATION**2)
         self.restart(self.delay + offset, deviation)
 
@@ -289,7 +286,7 @@ class DriftFilter:
         size, surprise = abs(found.offset), self.surprise(found)
         if found.strength < HEARD:
             return "unseen"
-        if (size < DRIFTED and (surprise < UNEXPECTED or size < TINY)) or (size < SMALL and surprise < EXPECTED):
+        if (size < DRIFTED and surprise < UNEXPECTED) or (size < SMALL and surprise < EXPECTED):
             return "there"
         if found.gain > STRANGE * gain:
             return "drowned"
@@ -310,7 +307,8 @@ class DriftFilter:
         spread += noise
         gain = measurement.offset / spread
         self.delay += delay * gain
-        self.slope = min(max(self.slope + slope * gain, -STEEPEST), STEEPEST)
+        steepest = UNEXPECTED * SLOPE_DEVIATION
+        self.slope = min(max(self.slope + slope * gain, -steepest), steepest)
         self._variance -= delay * delay / spread
         self._covariance -= delay * slope / spread
         self._since = 0
@@ -353,7 +351,7 @@ class JumpWitness:
     def convinced(self, found: DelayMeasurement) -> bool:
         """Take in a look at which the delay seems to have jumped by its offset; True if that is certain now."""
         shown, size = min(found.evidence / CHANCE, ONE_LOOK), abs(found.offset)
-        if abs(found.offset - self._offset) < AGREE:
+        if abs(found.offset - self._offset) < DRIFTED:
             self._shown += shown
         else:
             self._shown *= FORGET
@@ -361,5 +359,5 @@ class JumpWitness:
                 return False
             self._shown = shown
         self._offset = found.offset
-        lags = 4 * SMALL + 1 if size <= SMALL else 2 * REACH if size <= REACH else FAR * 6 * REACH
+        lags = 4 * SMALL + 1 if size <= SMALL else 2 * REACH if size <= REACH else CERTAIN**2 * 6 * REACH
         return self._shown > math.log(CERTAIN * lags)

@@ -25,8 +25,9 @@ FADE = 256
 _RISE = rise(FADE).astype(np.float32)
 REFLECTIONS, REFLECTED = 320, 0.75
 """Peaks up to 20 ms behind an arrival may be its reflections and count only this much against it."""
-COARSE = 32
-"""Lags that share one normalisation: the energy of what overlaps is summed up in steps of so many samples."""
+SAME = 32
+"""Lags that are one where only the place matters: they share one normalisation, by the energy that is summed up in steps of so many samples,
+and the lags of two looks may differ by it, which is what clocks and a person who walks move it by."""
 NEAR, ASIDE = 12, 512
 """Lags on each side of a peak that belong to it, and lags on each side of the one found over which `before` correlates the
 earlier window."""
@@ -106,7 +107,7 @@ class LagSearch:
         self.span, self._whole = _fast(sum(any_lag)), _fast(sum(self._for_utterance))
         self._short, self._signed = _fast(self._whole // 2), False
         sizes = (self._whole, self._short, WINDOW + 2 * ASIDE)
-        self._phases = {size: [_phase(one, size) for one in responses] for size in sizes}
+        self._phases = {size: [_phase(one[: PRE_ROLL + REFLECTIONS], size) for one in responses] for size in sizes}
 
     def prepare(self, ref: DelayBuffer | Playback, now: int, since: int | None = None) -> None:
         """Read the reference from sample counter `since`, or all of it and suppose nothing, up to `now`; transform it for `listen`."""
@@ -123,7 +124,7 @@ class LagSearch:
         _soften(r[first:])
         step = np.diff(r, prepend=r[:1])
         self._total = np.concatenate(
-            ([0.0], np.cumsum(np.square(step, out=step).reshape(-1, COARSE).sum(axis=1), dtype=np.float64))
+            ([0.0], np.cumsum(np.square(step, out=step).reshape(-1, SAME).sum(axis=1), dtype=np.float64))
         )
         self._reference = flattened(fft.rfft(r), 1e-5)
         self._prepared, self._since = now, since
@@ -163,7 +164,7 @@ class LagSearch:
         score = np.concatenate((correlation[self._size - before :], correlation[: self._lags - before]))
         if not self._signed:
             np.abs(score, out=score)
-        score *= np.repeat(1.0 / np.sqrt(overlap + 0.1 * overlap.max() + 1e-30), COARSE)[: self._lags]
+        score *= np.repeat(1.0 / np.sqrt(overlap + 0.1 * overlap.max() + 1e-30), SAME)[: self._lags]
         score /= np.sqrt(np.dot(score, score) + 1e-30)
         return score
 
@@ -205,11 +206,11 @@ class LagSearch:
         return cross
 
     def _overlap(self, late: int) -> Samples:
-        """Energy of the reference, first difference, that falls under the microphone's window, at every COARSE-th lag."""
+        """Energy of the reference, first difference, that falls under the microphone's window, at every SAME-th lag."""
         last = self._total.size - 1
-        lags = np.arange(0, self._lags, COARSE) - self._early
-        upper = np.clip((self._size + late - lags) // COARSE, 0, last)
-        lower = np.clip((self._start + late - lags) // COARSE, 0, last)
+        lags = np.arange(0, self._lags, SAME) - self._early
+        upper = np.clip((self._size + late - lags) // SAME, 0, last)
+        lower = np.clip((self._start + late - lags) // SAME, 0, last)
         return (self._total[upper] - self._total[lower]).astype(np.float32)
 
 
@@ -221,8 +222,8 @@ def _clearness(score: Samples, at: int) -> float:
 
 
 def _fast(size: int) -> int:
-    """The next larger size, a multiple of COARSE, whose transform is fast."""
-    return COARSE * fft.next_fast_len(-(-size // COARSE), real=True)
+    """The next larger size, a multiple of SAME, whose transform is fast."""
+    return SAME * fft.next_fast_len(-(-size // SAME), real=True)
 
 
 def _soften(x: Samples) -> None:

@@ -10,8 +10,8 @@ from typing import Literal
 
 import numpy as np
 
-from edgefilter.alignment.aligner import FIRST_LOOK, LOOKS, NEXT_LOOK, Aligned, Past
-from edgefilter.alignment.belief import Belief
+from edgefilter.alignment.aligner import FIRST_LOOK, LOOKS, Aligned, Past
+from edgefilter.alignment.belief import LOOK, Belief
 from edgefilter.alignment.lag_search import CERTAIN, MOST_LAG_S
 from edgefilter.alignment.utterances import FLOOR, VARIES, Sustained
 from edgefilter.dsp import fourier
@@ -65,7 +65,7 @@ class ReferenceWatch:
         self._rise = 10 ** (hop / (10 * SAMPLE_RATE))
         self._levels: deque[float] = deque(maxlen=LOOKS)
         self._sound = RobotSound(hop, bins)
-        self._played, self._played_at = 0.0, -NEXT_LOOK
+        self._played, self._played_at = 0.0, -LOOK
         self._products, self._sounding = np.zeros(3), 0
         self._said: set[str] = set()
         self._ever = False
@@ -199,7 +199,7 @@ class ReferenceWatch:
             if brought > LOUD * aligned.past.onsets.peak:
                 self._played += 0.01 * (brought - self._played) if self._played else brought
                 self._sound.learn(fourier.power(frame.mic))
-        lag = NEXT_LOOK if math.isnan(aligned.delay) else int(aligned.delay)
+        lag = LOOK if math.isnan(aligned.delay) else int(aligned.delay)
         if now - self._played_at < lag + SAMPLE_RATE // 4:
             return ""
         robot = self._sound.compare(fourier.power(frame.mic), frame.noise_psd)

@@ -421,7 +421,7 @@ def test_a_delay_that_no_look_has_seen_is_searched_again():
     aligner = Aligner(256)
     hops = run(aligner, mic[: RATE // 256 * 256], ref[: RATE // 256 * 256])
     assert abs(hops[-1].delay - 700 - HEAD) < CLOSE
-    aligner._switch(9000.0, 3.0)
+    aligner._switch(9000.0)
     aligner._gain = None  # as if it had been found there at first
     rest = slice(RATE // 256 * 256, None)
     hops = run(aligner, mic[rest], ref[rest])

@@ -86,14 +86,14 @@ def test_a_far_look_sees_three_times_as_far():
     assert seen(look(3007.0), far=True) == "elsewhere" and seen(look(3009.0), far=True) == "unseen"
 
 
-@pytest.mark.parametrize(("offset", "enough"), [(8.0, 20.0), (8.1, 30.0), (1024.0, 30.0), (-1025.0, 50.0)])
+@pytest.mark.parametrize(("offset", "enough"), [(8.0, 20.0), (8.1, 30.0), (1024.0, 30.0), (-1025.0, 55.7)])
 def test_a_jump_is_believed_from_so_much_evidence_on_as_chance_has_places(offset, enough):
     for share, believed in ((0.99, False), (1.01, True)):
         witness, half = JumpWitness(), look(offset, 1.0, 0.5 * share * enough)
         assert [witness.convinced(half) for _ in range(2)] == [False, believed]
 
 
-@pytest.mark.parametrize(("further", "believed"), [(0.69, True), (0.71, False), (-0.69, True)])
+@pytest.mark.parametrize(("further", "believed"), [(1.49, True), (1.51, False), (-1.49, True)])
 def test_the_evidence_of_looks_at_the_same_jump_is_added(further, believed):
     witness = JumpWitness()
     assert not witness.convinced(look(100.0, 1.0, 0.6 * 30.0))
@@ -127,8 +127,8 @@ def test_delay_and_drift_are_those_of_a_kalman_filter_with_a_look_at_the_middle_
         assert drift.deviation == pytest.approx(np.sqrt(belief[0, 0]), rel=1e-6)
 
 
-@pytest.mark.parametrize(("offset", "ppm"), [(3.0, 600.0), (-3.0, -600.0)])
-def test_no_clock_is_believed_to_drift_by_more_than_600_ppm(offset, ppm):
+@pytest.mark.parametrize(("offset", "ppm"), [(3.0, 750.0), (-3.0, -750.0)])
+def test_no_clock_is_believed_to_drift_by_more_than_750_ppm(offset, ppm):
     drift = DriftFilter()
     drift.restart(1000.0, 1.0)
     for _ in range(20):
