@@ -26,8 +26,8 @@ LIKELY_LAG_S = 2.0
 LATE = SAMPLE_RATE // 10
 """Samples by which a reference may come after its echo and is still found for an utterance; with LATEST they are found .15 s later."""
 LATEST, FURTHEST = 2 * SAMPLE_RATE, 5 * SAMPLE_RATE
-"""Of a look, a search that supposes no beginning of an utterance: samples by which the reference may come after its echo, and the longest
-lag, which is told but not followed. Of the microphone a LOOK is compared even at that lateness."""
+"""Range of a look, a search for the lag that does not need the beginning of an utterance, in samples: by how much the reference may come
+after its echo, and the longest lag; one beyond MOST_LAG_S is reported to the user, and nothing is removed there."""
 LOOKS, FIRST_LOOK = 12, SAMPLE_RATE // 2
 """Looks that are remembered, and samples of an utterance after which there is one; each LOOK another, and one more at each realignment.
 Speech that begins while the reference is silent waits for as long until it is nobody's but a human's: the reference may follow."""
@@ -364,7 +364,7 @@ class Aligner:
                 yield self._take(found)
                 return
             yield False
-            # where samples are missing the windows before were heard at other lags
+            # where the reference lacks samples, earlier windows had other lags
             alike = self._responses is not None or self._coarse or self._belief.lossy > 1.0
             if not found.old or found.odds <= (CERTAIN * ALIKE if alike else 1.0 / CERTAIN) or (alike and looked_back):
                 return

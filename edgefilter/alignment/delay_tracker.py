@@ -49,7 +49,7 @@ EXPECTED, UNEXPECTED = 3.0, 5.0
 """Surprise, in standard deviations, up to which an error of up to SMALL samples is drift, and one of up to DRIFTED, and from
 which on a look contradicts what is believed."""
 SLOPE_DEVIATION = 150e-6
-"""Standard deviation of two clocks' difference before anything is known, samples per sample; it never exceeds UNEXPECTED of them."""
+"""Standard deviation of two clocks' difference before anything is known, samples per sample; no difference beyond UNEXPECTED times it is believed."""
 BIAS = 0.1
 """Samples by which looks err alike where the response that is supposed explains nothing of the microphone."""
 

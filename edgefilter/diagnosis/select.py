@@ -110,7 +110,7 @@ def _exchange(bench: Workbench, start: EchoModel, model: EchoModel, name: str) -
 
 
 def split(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
-    """The model in which each effect that has imitated a simpler one as well is replaced by both."""
+    """The model, with a simpler effect added beside each effect whose fit had imitated that simpler one."""
     for name in added(start, model):
         apart = _apart(bench, model, name)
         if apart is not model and standing(bench, start, apart) is apart:

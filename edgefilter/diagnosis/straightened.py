@@ -152,7 +152,7 @@ class Straightened:
         return model.still.fitted(name, here._unmoved[key])
 
     def _without(self, read: Array) -> Measurement:
-        """The measurement with its recording as it was ahead of what read its samples there, (n,)."""
+        """The measurement with its recording unwarped: sample i of the warped recording was read at position read[i], (n,)."""
         n = np.arange(read.size)
         at = np.interp(n, read, n)
         # at twice the sampling rate, at which the interpolation filter passes the whole band

@@ -27,7 +27,7 @@ STEADY_DB = 1.5
 its own spectrum (the loud and the quiet tenth of three real ones by 0.9 to 1.0, of a running tap by 1.2; of a talker, or of
 something that slams, by more)."""
 REMEMBERED = 6
-"""Models of which a measurement keeps what was worked out: one that a search goes on from, and some beside it."""
+"""Number of models whose predictions a measurement keeps: the one from which a search goes on, and some that it compares with it."""
 
 
 class VoiceModel(Protocol):

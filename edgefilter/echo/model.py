@@ -210,7 +210,7 @@ class EchoModel:
         return self._with_those(lambda name, _: not find(name).only_moves)
 
     def read_at(self, size: int) -> Array:
-        """The position in what `still` predicts from which each sample of what the model predicts comes, (size,)."""
+        """Where in the prediction of `still` each sample of this model's prediction is read, (size,)."""
         read = n = np.arange(float(size))
         for effect, values in reversed(chain(self.effects)):
             read = np.interp(read, n, effect.read_at(values, size, SAMPLE_RATE)) if effect.only_moves else read

@@ -51,10 +51,10 @@ class Reach:
 
 
 class GainFit:
-    """Unknowns (k,) with which make(reference, unknowns), a few signals, each through a short filter, explain a recording.
+    """Fits unknowns (k,): make(reference, unknowns) gives a few signals whose sum, each through a short filter, is to explain a recording.
 
     The filters are solved for at each step (Golub & Pereyra 1973, "variable projection"). x: the excerpt of the reference.
-    loud_db: level of its loudest 20 ms. without: energy that the reference itself leaves of it.
+    loud_db: level of its loudest 20 ms. without: energy of the residual if the reference itself is the only signal.
     """
 
     def __init__(
