@@ -23,8 +23,8 @@ DRIVER, AMPLIFIER = ("force_factor", "stiffness", "damping"), ("even", "odd")
 RESONANCES_HZ, REACH_HZ = (250.0, 180.0, 215.0, 300.0, 370.0), (160.0, 1000.0)
 """Of small drivers, the usual one first; how low is tried, where MOTION_TAPS are just enough, and how high."""
 EXCURSION, KNEES = 0.7, (0.3, 0.15, 0.6)
-"""Where the curves of the loudspeaker's laws bend, relative to the largest displacement and the largest sample in the fit; the usual ones first. Which
-of them fits is chosen on the loudest seconds, how much the curves bend is fitted to the whole recording."""
+"""Where the curves of the loudspeaker's laws bend, relative to the largest displacement and the largest sample in the fit; the usual ones
+first. Which of them fits is chosen on the loudest seconds, how much the curves bend is fitted to the whole recording."""
 PEAK = 0.9999
 """The largest is this quantile."""
 HELD = 1e-3
