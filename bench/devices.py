@@ -37,7 +37,6 @@ GLANCE = (
     "aec3+silero",
     "crnn-uncalibrated+silero",
     "crnn-uncalibrated",
-    "crnn-uncalibrated-asked",
 )
 """Rows of the table that README.md quotes."""
 SOON_S = 0.5
@@ -144,7 +143,7 @@ def at_a_glance(rows: Sequence[dict], able: Sequence[System]) -> dict:
         row, _, detector = name.partition("+")
         laid, alone = (of(rows, row, part) for part in ("laid", "alone"))
         told, heard = (of(rows, name, part) for part in ("alone", "laid"))
-        title = f"edgefilter: {known[row].title}" if known[row].kind in ("own", "asked") else known[row].title
+        title = f"edgefilter: {known[row].title}" if known[row].kind == "own" else known[row].title
         cells.append([title, mean(per_device(alone, "erle_db"), "erle_db"),
                       mean(per_device(laid, "si_sdr"), "si_sdr"), mean(per_device(laid, "capped"), "capped"),
                       DETECTORS[detector].title if detector else "edgefilter", starts(told), soon(heard)])  # fmt: skip
