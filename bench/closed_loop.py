@@ -1,4 +1,4 @@
-"""Run the filter over a recording hop by hop, as live; the recorded robot may lower its voice when the filter asks for it (closed loop)."""
+"""Run the filter over a recording hop by hop, as live; the recorded robot may lower its voice when the filter asks for it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import soundfile
 
 from edgefilter import EgoFilter, Event, Profile
-from edgefilter.audio.fade import Fade
+from edgefilter.closed_loop import closed_loop
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -44,24 +44,19 @@ def listen(
     mic: Samples, ref: Samples, profile: Profile | None, engine: str, robot: Robot | None = None, **more: Any
 ) -> Output:
     """Run the filter over mic (n,) or (n, microphones) and ref (n,); more: further arguments of EgoFilter."""
-    ego = EgoFilter(profile, engine=engine, barge_in=BargeInSettings(ask_db=robot.ask_db) if robot else None, **more)
-    mic, ref = mic.astype(np.float32), ref.astype(np.float32)
-    fade, gains, done, probability = Fade(), np.ones(ref.size, np.float32), [], []
-    for at in range(0, ref.size, ego.hop):
-        block = slice(at, min(at + ego.hop, ref.size))
-        if robot:
-            fade.wanted = ego.voice_gain
-            gains[block] = fade.apply(gains[block], SAMPLE_RATE)
-            then = np.arange(block.start, block.stop) - robot.late
-            mic[block] += (np.where(then < 0, 1.0, gains[then]) - 1.0).astype(np.float32) * robot.echo[block]
-        done.append(ego.process(mic[block], gains[block] * ref[block]))
-        probability.append(ego.speech_probability)
-    if robot and robot.file:
-        soundfile.write(robot.file, np.stack((gains * ref, mic), axis=1), SAMPLE_RATE)
+    mic, ref = np.array(mic, np.float32), np.array(ref, np.float32)
+    robot = robot or Robot(np.zeros_like(mic), 0, 0.0)
+    ego = EgoFilter(profile, engine=engine, barge_in=BargeInSettings(ask_db=robot.ask_db), **more)
+    done, probability = [], []
+    for out in closed_loop(ego, mic, ref, robot.echo, robot.late):
+        done.append(out)
+        probability.append(ego.speech_probability or 0.0)
+    if robot.file:
+        soundfile.write(robot.file, np.stack((ref, mic), axis=1), SAMPLE_RATE)
     out = np.concatenate((*done, ego.flush()))
     if ego.speech_probability is None:
         return Output(out)
-    return Output(out, ego.events(), [value or 0.0 for value in probability], ego.hop)
+    return Output(out, ego.events(), probability, ego.hop)
 
 
 def recorded(mic: Samples, ref: Samples, ask_db: float) -> Robot | None:

@@ -24,6 +24,7 @@ from bench.detectors import DETECTORS
 from bench.recordings import Clip, NotHere, Signals
 from edgefilter import EgoFilter, PathLearner, Profile, calibrate
 from edgefilter.calibration.calibrate import FARTHEST
+from edgefilter.closed_loop import ASK_DB
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.dsp.lag import correlation_near, flat_cross, highest, top
 from edgefilter.dsp.metrics import si_sdr
@@ -38,8 +39,6 @@ OWN = ("linear", "ss", "crnn")
 WAYS = {"": "calibrated", "-learning": "calibrated and learning", "-uncalibrated-learning": "learning only",
         "-uncalibrated": "uncalibrated"}  # fmt: skip
 LISTEN = "-listen"
-ASK_DB = 12.0
-"""By how much the robot lowers its voice when the filter asks for it, dB: about as much as people do when another begins to talk."""
 ARRAYS = (2, 3, 4)
 """Numbers of microphones, of conversations that have so many."""
 TRUE_LAG = "-true-lag"

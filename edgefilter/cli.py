@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import importlib
 import io
-import math
 import os
 import sys
 from collections.abc import Callable
@@ -15,52 +14,23 @@ from pathlib import Path
 from typing import Any, NoReturn, get_args
 
 from edgefilter import __version__
-from edgefilter.audio.channels import Channels
 from edgefilter.commands.display import STATUS_LEGEND, own_words_only
 from edgefilter.commands.outputs import check_outputs
 from edgefilter.commands.signals import on_signal
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.echo.effects.catalogue import names
 from edgefilter.echo.user_effects import load_effect
-from edgefilter.engines import ENGINES, HAVE_MODEL
+from edgefilter.engines import HAVE_MODEL
 from edgefilter.errors import EdgefilterError, UsageError, printable
-from edgefilter.filter.barge_in import BargeInSettings
+from edgefilter.options import ASK, CONFIRM, ENGINE, MIC_CHANNELS, channel, number, positive, whole
 from edgefilter.types import SoundFor
 
-ENGINE = {
-    "default": "auto",
-    "metavar": "ENGINE",
-    "help": f"auto, {', '.join(ENGINES)} (default: %(default)s); docs/cli.md says what each does",
-}
-MIC_CHANNELS = {
-    "type": Channels.parse,
-    "metavar": "N,N,...|all",
-    "help": "channels that are microphones, one to eight, from 0, or 'all' (docs/arrays.md); otherwise the mean is taken",
-}
 EFFECTS = {
     "action": "append",
     "default": [],
     "metavar": "FILE.py",
     "help": "an effect of your own (docs/own_effect.md); repeatable",
 }
-
-
-CONFIRM = {
-    "type": lambda text: number(0.0, 10.0, "a time from 0 to 10 s", closed=True)(text),
-    "default": BargeInSettings.confirm_s,
-    "metavar": "S",
-    "help": "longest time from the suspicion that the human speaks to certainty; 0: the suspicion is enough (default: %(default)g)",
-}
-
-
-ASK = {
-    "type": lambda text: number(0.0, 40.0, "0 to 40 dB", closed=True)(text),
-    "default": BargeInSettings.ask_db,
-    "metavar": "DB",
-    "help": "lower the robot's voice by so much while the human may have begun to speak, to hear who it was (default: %(default)g)",
-}
-
-
 JSON = {"metavar": "FILE", "help": "write the figures as JSON ('-': standard output)"}
 REPORT = {"metavar": "R.html", "help": "write a page with pictures and sound, in one file"}
 FORCE = {"action": "store_true", "help": "write the profile even if the running filter is worse with it"}
@@ -406,36 +376,7 @@ def effect_file(text: str) -> str:
     return text
 
 
-def whole(least: int, most: int, expected: str) -> Callable[[str], int]:
-    """A function that reads a whole number from least to most, else raises an error that says what was expected."""
-
-    def read(text: str) -> int:
-        if not text.strip().isdecimal() or not least <= int(text) <= most:
-            raise argparse.ArgumentTypeError(f"'{text}' is not {expected}")
-        return int(text)
-
-    return read
-
-
-def number(least: float, most: float, expected: str, closed: bool = False) -> Callable[[str], float]:
-    """The same for any number between them, closed: or one of them."""
-
-    def read(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not (least <= value <= most if closed else least < value < most):
-            raise argparse.ArgumentTypeError(f"'{text}' is not {expected}")
-        return value
-
-    return read
-
-
-positive = number(0.0, 1e6, "a number above 0")
 eight = whole(1, 8, "1 to 8 channels")
-channel = whole(0, 63, "the number of a channel, 0 to 63")
-"""Of a device or a file, counted from 0: interfaces of studios have so many."""
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import soundfile
 
-from edgefilter.audio.fade import Fade
 from edgefilter.audio.files import FileSink, FileSource, write_file
+from edgefilter.closed_loop import ASK_DB, closed_loop
 from edgefilter.commands.add import Fitted, fit
 from edgefilter.commands.display import describe_latency, print_result, progress, report_part, say
 from edgefilter.commands.outputs import CASES
@@ -30,8 +30,6 @@ from edgefilter.report.text import decibels, headline
 from edgefilter.session import filter_blocks
 from edgefilter.types import SAMPLE_RATE, Samples
 
-ASK_DB = 12.0
-"""By how much the robot lowers its voice to hear whether a human interrupts it: as people do."""
 HUMAN_DB, HUMAN_AT_S = -20.0, 1.0
 """Level of the human over the robot in the same seconds, and when the human begins to interrupt it."""
 
@@ -102,14 +100,9 @@ def interrupted(mic: Samples, reference: Samples) -> Samples:
     left, stats = known.robot_removed()[:, 0], known.stats()["alignment"]  # whole hops
     lag = round(stats["delay_samples"] or 0) if stats else 0
     ego = EgoFilter(DEMO / "profile.npz", engine="crnn", barge_in=BargeInSettings(ask_db=ASK_DB))
-    fade, gains, heard = Fade(), np.ones(left.size + lag, np.float32), mic[: left.size].copy()
-    for at in range(0, left.size, ego.hop):
-        now = slice(at, at + ego.hop)
-        fade.wanted = 0.0 if ego.human_speaks else ego.voice_gain
-        played = fade.apply(np.ones(ego.hop, np.float32), SAMPLE_RATE)
-        gains[at + lag : at + lag + ego.hop] = played
-        heard[now] += (gains[now] - 1.0) * (mic[: left.size] - left)[now]
-        ego.process(heard[now], played * reference[now])
+    heard, played = mic[: left.size].copy(), reference[: left.size].copy()
+    for _ in closed_loop(ego, heard, played, heard - left, lag, stops=True):
+        pass
     return heard
 
 

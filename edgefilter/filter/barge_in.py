@@ -168,7 +168,8 @@ class BargeIn:
         self._forget()
 
     def _forget(self) -> None:
-        self._hops, self._asked, self._evidence, self._somebody, self._certain = 0, 0, 0.0, False, False
+        self._hops, self._anew, self._asks = 0, 0, False
+        self._evidence, self._somebody, self._certain = 0.0, False, False
         self._told: EventKind | None = None
 
     @property
@@ -179,7 +180,7 @@ class BargeIn:
     @property
     def asking(self) -> bool:
         """Whether the robot should speak more softly now, so that what is heard tells whether it was the robot."""
-        return self._asked > 0 and not self._certain
+        return self._asks and not self._certain
 
     @property
     def waited(self) -> int:
@@ -218,10 +219,10 @@ class BargeIn:
             self._needed = self._threshold + self.own.higher
             if log_odds(probability) < self._needed:
                 return None
-        if not self._hops and heard_after <= self._longest:
-            self._asked = heard_after
-        if self._certain and not self._told and not wait:
-            self._asked, self._certain = self._hops, False
+        if not self._hops or (self._certain and not self._told and not wait):  # suspected, or the wait is over
+            asked = heard_after if heard_after <= self._longest else 0
+            self._asks, self._anew = asked > 0, self._hops + asked
+            self._evidence, self._certain = 0.0, False
         self._hops += 1
         if self._silent >= self._pause or not self._holds(probability):
             return self.end()
@@ -235,20 +236,19 @@ class BargeIn:
         """Whether what was suspected is not dismissed by another hop."""
         if self._certain:
             return True
-        if self._hops == self._asked + 1:
+        if self._hops == self._anew + 1:
             self._evidence = 0.0
         if self._hops > 1:  # the first was chosen for its odds
             self._evidence += log_odds(probability) - self._needed
-        if (
-            self._hops > self._asked > 0
-        ):  # a human goes on speaking, be it after a pause; a robot that is softer does not
+        # a human goes on speaking, be it after a pause; a robot that is softer does not
+        if self._hops > self._anew > 0:
             self._evidence = max(self._evidence, 0.0)
             self._certain = self._evidence >= self._bound
-            return self._certain or self._hops < self._asked + self._longest
+            return self._certain or self._hops < self._anew + self._longest
         late = self._hops >= self._longest
         self._somebody |= self._evidence >= (0.0 if late else self._bound)
         # while the robot lowers its voice, only what follows tells whether it was the robot
-        self._certain = self._somebody and (not self._asked or self._evidence >= self._sure)
+        self._certain = self._somebody and (not self._asks or self._evidence >= self._sure)
         return self._somebody or (self._evidence > -self._bound and not late)
 
 

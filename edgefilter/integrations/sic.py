@@ -30,6 +30,7 @@ from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.integrations.duplex import Duplex
+from edgefilter.options import ASK, CONFIRM, ENGINE, MIC_CHANNELS
 from edgefilter.types import SAMPLE_RATE, Event
 
 
@@ -37,14 +38,11 @@ def _options(words: list[str] | None = None) -> dict[str, Any]:
     """What a command line says of the filter, as keywords of _ears."""
     parser = argparse.ArgumentParser(prog="python -m edgefilter.integrations.sic", description=__doc__.splitlines()[0])
     parser.add_argument("--profile", help="the calibrated robot")
-    parser.add_argument("--engine", default="auto", help="one beside which the network can judge speech")
+    parser.add_argument("--engine", **ENGINE)
     parser.add_argument("--channels", type=int, default=1, help="of the microphone's sound, interleaved")
-    told = "those of them that form an array, from 0, as 0,1,2,3; otherwise the mean of all is taken"
-    parser.add_argument("--mic-channels", type=Channels.parse, help=told)
-    told = "longest time from the suspicion that the human speaks to certainty, s"
-    parser.add_argument("--confirm-s", type=float, default=BargeInSettings.confirm_s, help=told)
-    told = "what the program lowers the voice by while the human may have begun to speak, to hear who it was, dB"
-    parser.add_argument("--ask-db", type=float, default=BargeInSettings.ask_db, help=told)
+    parser.add_argument("--mic-channels", **MIC_CHANNELS)
+    parser.add_argument("--confirm-s", **CONFIRM)
+    parser.add_argument("--ask-db", **ASK)
     return vars(parser.parse_args(words))
 
 

@@ -47,6 +47,7 @@ from edgefilter.filter.turns import BEFORE_S
 from edgefilter.integrations.doors import complain_briefly, is_own
 from edgefilter.integrations.duplex import MOST_QUEUED_S, Duplex, as_pcm16, from_pcm16
 from edgefilter.integrations.turns import TurnByTurn
+from edgefilter.options import ASK, CONFIRM, ENGINE, MIC_CHANNELS, channel
 from edgefilter.types import SAMPLE_RATE, Event
 
 MOST_BYTES = round(MOST_QUEUED_S * SAMPLE_RATE) * np.int16().itemsize
@@ -491,17 +492,14 @@ def main(words: list[str] | None = None) -> int:
     for end, rate in (("mic", 16_000), ("snd", 22_050)):
         parser.add_argument(f"--{end}-command-rate", type=int, default=rate, help="what the command's sound has")
         parser.add_argument(f"--{end}-command-channels", type=int, default=1, help="what the command's sound has")
-    told = "channels of the microphone that form an array, from 0, as 1,2,3; otherwise the mean of all is taken"
-    parser.add_argument("--mic-channels", type=Channels.parse, help=told)
+    parser.add_argument("--mic-channels", **MIC_CHANNELS)
     told = "channel of the microphone, from 0, that holds what is played; goes with --mic-channels"
-    parser.add_argument("--reference-channel", type=int, help=told)
+    parser.add_argument("--reference-channel", type=channel, metavar="N", help=told)
     parser.add_argument("--recogniser", help="URI of a service that makes text of speech: it gets finished turns")
     parser.add_argument("--profile", help="the calibrated robot")
-    parser.add_argument("--engine", default="auto", help="one beside which the network can judge speech")
-    told = "longest time from the suspicion that the human speaks to certainty, s"
-    parser.add_argument("--confirm-s", type=float, default=BargeInSettings.confirm_s, help=told)
-    told = "lower the voice by so much while the human may have begun to speak, to hear who it was, dB"
-    parser.add_argument("--ask-db", type=float, default=BargeInSettings.ask_db, help=told)
+    parser.add_argument("--engine", **ENGINE)
+    parser.add_argument("--confirm-s", **CONFIRM)
+    parser.add_argument("--ask-db", **ASK)
     parser.add_argument("--mic-uri", default=MIC_URI, help="where satellites find the microphone")
     parser.add_argument("--snd-uri", default=SND_URI, help="where satellites find the loudspeaker")
     parser.add_argument("--asr-uri", default=ASR_URI, help="where Home Assistant finds the recogniser")

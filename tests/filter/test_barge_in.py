@@ -401,3 +401,12 @@ def test_what_had_to_wait_is_tested_on_what_follows():
     assert [each for each in told if each] == ["speech_suspected", "speech_dismissed"] and not talk.speaking
     assert not any(talk.note(0.9999, wait=30) for _ in range(20))
     assert [talk.note(each) for each in (0.0, 0.9999)] == ["speech_suspected", "speech_started"]
+
+
+def test_once_the_lag_is_known_the_robot_may_be_asked_and_what_is_heard_of_the_lower_voice_decides():
+    talk, after = BargeIn(HOP_S, calibrated=True), 5
+    assert not any(talk.note(0.9999, wait=30) for _ in range(20)) and not talk.asking
+    told = [(talk.note(p, heard_after=after), talk.asking) for p in (*[0.9] * (after + 1), *[0.0] * 30)]
+    assert [(at, what) for at, (what, _) in enumerate(told) if what][0] == (0, "speech_suspected")
+    assert all(asking for _, asking in told[: after + 1])
+    assert [what for what, _ in told if what][1:] == ["speech_dismissed"] and not talk.asking
