@@ -86,7 +86,7 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
         type=int,
         nargs="+",
         metavar="N",
-        help="of the paper's network: of its first seven convolutions and of the last (default: 64 8; of one number an eighth)",
+        help="of the paper's network: filters of its first seven convolutions and of the last (default: 64 8; one number: the last has an eighth)",
     )
     parser.add_argument("--lstm", type=int, help="units in each direction of the paper's network (default: 400)")
     parser.add_argument("--hidden", type=int, help=f"units (default: {EdgeConfig.hidden}; of the paper's network 600)")

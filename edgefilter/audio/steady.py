@@ -75,7 +75,7 @@ class SteadyInput:
         return self._earlier_overruns + self.port.inlet.flags
 
     def take(self) -> Samples:
-        """What came since the last call (n,) or (n, channels), or silence for as long as nothing can come."""
+        """What came since the last call (n,) or (n, channels), or as much silence as time has passed while the device is away."""
         now = clock()
         samples = self.port.take() if self._open else self._latest[:0]
         self._latest = samples

@@ -131,9 +131,9 @@ def _record_moving(args: argparse.Namespace, folder: Path) -> tuple[Samples, Sam
 
 
 def take(args: argparse.Namespace, sound: Samples, what: str, file: Path | None = None) -> Samples:
-    """Play on --speaker and record on --input, again with larger buffers where something was lost: the hole would be measured.
+    """Play on --speaker and record on --input, again with larger buffers if samples were lost, since a gap would be measured as part of the path.
 
-    file: keeps each recording, also one with holes or without an end.
+    file: keeps each recording, also one with gaps or cut off.
     """
 
     def keep(recorded: Samples) -> None:

@@ -189,7 +189,7 @@ class EventCommand:
 
 
 class Lowering:
-    """Ends or lowers what the robot says while the human speaks, as a word of LOWERED says, and where the filter asks for it."""
+    """Ends or lowers what the robot says while the human speaks (a word of LOWERED says which), and lowers it when the filter asks."""
 
     def __init__(self, speech: SpokenReference, ego: EgoFilter, how: str | None) -> None:
         self._speech, self._ego, self._how, self._gain = speech, ego, how, 1.0

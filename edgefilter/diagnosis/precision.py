@@ -54,7 +54,7 @@ def precision(found: Found, findings: Sequence[Finding]) -> Precision:
 
 
 def _half_width(finding: Finding, parameter: Parameter, index: int) -> float | None:
-    """Of the interval; None where the fits to thirds have not given one."""
+    """Half the width of a parameter's interval; None where fits to thirds of the recording gave no interval."""
     interval = finding.parameters[parameter.name]
     low, high = (float(np.ravel(bound)[index]) for bound in (interval.low, interval.high))
     return None if (low, high) == (parameter.low, parameter.high) else 0.5 * (high - low)

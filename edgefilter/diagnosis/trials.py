@@ -246,7 +246,7 @@ class Workbench:
         return found + [trial for trial in resorts if trial is not None]
 
     def filtered_ahead(self, model: EchoModel) -> EchoModel | None:
-        """The model with one filter ahead of the loudspeaker in place of its filters on the echo path; None if it has no such filters."""
+        """The model with its filters of the echo path replaced by one filter ahead of the loudspeaker; None if it has none on the path."""
         others = model
         for name in added(self._start, model):
             if _on_path(name):

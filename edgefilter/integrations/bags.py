@@ -47,7 +47,7 @@ def extract(bag: Path, topics: dict[str, str], folder: Path, rate: int, channels
             written = 0
             for time, samples in parts:
                 missing = round((time - begin) * rate) - samples.size - written
-                # messages come with jitter: silence stands in for what is as late as a device's
+                # messages come with jitter: silence stands in only for sound that is later than a device's may be
                 if missing > MAX_WAIT / SAMPLE_RATE * rate or (missing > 0 and not written):
                     sink.write(resampler.push(np.zeros(missing, np.float32)))
                     written += missing

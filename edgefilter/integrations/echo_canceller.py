@@ -122,7 +122,7 @@ class EchoCanceller:
         self._from_filter = [Resampler(SAMPLE_RATE, rate) for _ in self._heard]
         self.delay = self._filters[0].latency
         if rate != SAMPLE_RATE:
-            # what both resamplers and the filter hold back, and a sample for each of the three that counts whole ones
+            # delays of both resamplers and the filter, and one sample of rounding for each of the three
             held_s = self._of_ref.delay_s + self.delay / SAMPLE_RATE + self._from_filter[0].delay_s
             self.delay = math.ceil(held_s * rate + 2 * max(rate / SAMPLE_RATE, 1.0))
         self._ready: Samples = np.zeros((len(self._heard), self.delay), np.float32)

@@ -382,7 +382,7 @@ async def _message(connection: ServerConnection, patience_s: float, frames: int)
 
 
 def _refuse(connection: ServerConnection, why: str) -> None:
-    """Close with a word; what still comes is read, so that the word is not lost, and forgotten."""
+    """Close with a reason; what still comes is read and dropped, so that the reason is not lost."""
     # RFC 6455, 5.5: 125 bytes with the code
     connection.protocol.fail(1008, why.encode()[:120].decode(errors="ignore"))
     connection.send_data()

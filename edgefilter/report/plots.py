@@ -113,7 +113,7 @@ def _draw_bands(axis: Axes, profile: Profile) -> None:
     axis.bar(low, profile.band_snr_db, width=high - low, align="edge", color=colours, edgecolor="white")
     axis.axhline(LOW_SNR_DB, color=INK, linewidth=0.8, linestyle=":")
     axis.set_xscale("log")
-    title = f"Signal-to-noise ratio of the sweep by third octave\nred: below {LOW_SNR_DB:.0f} dB, too noisy"
+    title = f"Signal-to-noise ratio of the sweep by third octave\nred: too noisy, below {LOW_SNR_DB:.0f} dB"
     by_order = zip(DISTORTION_ORDERS, profile.distortion_db, strict=True)
     orders = ", ".join(f"{order}: {level:.0f}" for order, level in by_order)
     _label(axis, f"{title}\ndistortion by harmonic, dB: {orders}", "Hz", "dB")

@@ -40,7 +40,8 @@ from edgefilter.types import SAMPLE_RATE, Array, Samples
 TAPS = 320
 """20 ms of ringing after a knock."""
 RIDGE = 1e-2
-"""Of the sounds' taps, re the energy of the knocks: neighbouring taps of a voice's knocks are much alike."""
+"""Regularisation of the fit of a knock's sound, relative to the energy of the knocks: a voice's knocks come so close together that
+neighbouring taps can hardly be told apart."""
 WORTH = 2.5
 """What each tap has to explain, in units of the residual's variance, for the sounds to be real."""
 REFINED = 3
