@@ -16,7 +16,7 @@ from edgefilter.commands.calibrate import take
 from edgefilter.commands.display import print_result, progress, write_json
 from edgefilter.commands.outputs import question_of
 from edgefilter.commands.recordings import load, read, read_voice
-from edgefilter.diagnosis.advice import RIVAL, remaining
+from edgefilter.diagnosis.candidates import RIVAL, remaining
 from edgefilter.diagnosis.probe import ENOUGH, SOUND_S, Answer, Inquiry
 from edgefilter.diagnosis.recording import Recording
 from edgefilter.echo.effects.catalogue import find

@@ -1,66 +1,42 @@
-"""All effects that a search has tried, the best first: gain, size, rank and why each was named or not."""
+"""All effects that a search has tried, the best first, why each was named or not, and which explanations remain."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
-
-import numpy as np
 
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.ordinary import percent
 from edgefilter.diagnosis.result import Candidate, Fate
-from edgefilter.diagnosis.straightened import HOP, STEP, bands
 from edgefilter.diagnosis.trials import Found, Tried
-from edgefilter.echo.effect import neutral
 from edgefilter.echo.effects.catalogue import find
-from edgefilter.echo.measurement import Values
+
+RIVAL = 0.7
+"""Part of the fall in level by what is named, from which on another explanation remains: twice as far behind as a
+simpler effect may be and is named all the same (Criteria.nearly). Not tuned."""
+MOST = 4
+"""Explanations that remain at most, the best ones: each costs a fit for each sound that is tried."""
 
 
 def candidates(found: Found, named: Collection[str]) -> tuple[Candidate, ...]:
     """The table of a search, and of the changes of the fan that it has seen; named: the effects that the diagnosis gives.
 
-    The information criterion (Schwarz 1978) is that of Score.level_db's likelihood: ln(N) for each number of the fit,
-    less 2 N times the fall of the level, N the samples held out: the penalty comes on top of that. An effect that was
-    tried beside others only is ranked by its gain there.
+    An effect that was tried beside others only is ranked by its gain there.
     """
-    held = float(found.recording.starts.size * STEP) * bands().freedom.sum() / (HOP - 1)
     tried = {entry.name: entry for entry in found.tried}
     seen = {step.name: Tried(step.name, None if place else step, step) for place, step in enumerate(found.steps)}
-    rows = [_row(entry, found, named, held) for entry in {**seen, **tried}.values()]
-    ranked = sorted((row for row in rows if row.delta_bic is not None), key=lambda row: row.delta_bic or 0.0)
-    rest = sorted((row for row in rows if row.delta_bic is None), key=lambda row: row.effect)
+    rows = [_row(entry, found, named) for entry in {**seen, **tried}.values()]
+    gains = {row.effect: row.beside_db if row.gain_db is None else row.gain_db for row in rows}
+    ranked = sorted((row for row in rows if gains[row.effect] is not None), key=lambda row: -(gains[row.effect] or 0.0))
+    rest = sorted((row for row in rows if gains[row.effect] is None), key=lambda row: row.effect)
     return (*(replace(row, rank=place) for place, row in enumerate(ranked, start=1)), *rest)
 
 
-def size_of(name: str, values: Values) -> float:
-    """How many numbers carry an effect: one for each that is not neutral, and of a filter as many as hold its energy.
-
-    The latter is the exponential of the entropy of how the energy is spread: a tail that dies away is fewer numbers
-    than it has taps.
-    """
-    plain, given = neutral(find(name)), {p.name for p in find(name).parameters if p.given}
-    count = 0.0
-    for key, value in values.items():
-        change = np.ravel(np.asarray(value, float) - plain[key]) ** 2
-        if key in given or not change.any():
-            continue
-        part = change[change > 0.0] / change.sum()
-        count += float(np.exp(-np.sum(part * np.log(part)))) if part.size > 1 else 1.0
-    return count
-
-
-def _row(entry: Tried, found: Found, named: Collection[str], held: float) -> Candidate:
+def _row(entry: Tried, found: Found, named: Collection[str]) -> Candidate:
     verdict, why = _fate(entry, found, named)
     beside = next((step for step in found.steps if step.name == entry.name), entry.beside)
     alone_db, beside_db = (trial.gain_db if trial else None for trial in (entry.alone, beside))
-    row = Candidate(entry.name, verdict, why, alone_db, beside_db)
-    trial = entry.alone or beside
-    if not trial:
-        return row
-    numbers = size_of(entry.name, trial.values)
-    bic = numbers * float(np.log(max(held, 2.0))) - held * np.log(10.0) / 5.0 * trial.gain_db
-    return replace(row, numbers=numbers, delta_bic=float(bic))
+    return Candidate(entry.name, verdict, why, alone_db, beside_db)
 
 
 def _fate(entry: Tried, found: Found, named: Collection[str]) -> tuple[Fate, str]:
@@ -84,3 +60,24 @@ def _fate(entry: Tried, found: Found, named: Collection[str]) -> tuple[Fate, str
         f"beside what is named it adds {beside.gain_db:.2f} dB" if beside else "beside what is named it adds nothing"
     )
     return "explained by another", added
+
+
+def asks(tried: Sequence[Candidate]) -> tuple[str, ...]:
+    """A line where several explanations remain: the robot can ask which it is."""
+    left = [" with ".join(effects) for effects in remaining(tried)]
+    told = f"{', '.join(left[:-1])} or {left[-1]}: edgefilter probe plays what tells them apart" if left[1:] else ""
+    return (told,) if told else ()
+
+
+def remaining(tried: Sequence[Candidate]) -> tuple[tuple[str, ...], ...]:
+    """The effects of each explanation that remains: all that are named, then each that alone explains nearly as much.
+
+    Events are left out, since no other recording has them.
+    """
+    named = [row for row in tried if row.verdict == "named"]
+    rivals = [row for row in tried if row.verdict in ("explained by another", "explains too little")]
+    gains = [row.gain_db or 0.0 for row in rivals]
+    most = sum(max(row.beside_db or 0.0, row.gain_db or 0.0) for row in named) if named else max(gains, default=0.0)
+    near = sorted((r for r in rivals if (r.gain_db or 0.0) >= RIVAL * most > 0.0), key=lambda r: -(r.gain_db or 0.0))
+    sets = [[row.effect for row in rows if not find(row.effect).event] for rows in (named, *([row] for row in near))]
+    return tuple(dict.fromkeys(tuple(effects) for effects in sets if effects))[:MOST]

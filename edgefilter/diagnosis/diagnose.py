@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
-from edgefilter.diagnosis.advice import advice, asks
-from edgefilter.diagnosis.candidates import candidates
+from edgefilter.diagnosis.candidates import asks, candidates
 from edgefilter.diagnosis.compare import Comparison, describe, independence_of
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.findings import evidence_of, findings_of
@@ -17,7 +17,7 @@ from edgefilter.diagnosis.leftover import left_in_words, leftover
 from edgefilter.diagnosis.precision import precision
 from edgefilter.diagnosis.result import Diagnosis, Finding, Verdict, in_order
 from edgefilter.diagnosis.straightened import Straightened, share_of
-from edgefilter.diagnosis.trials import Found
+from edgefilter.diagnosis.trials import Found, steps_of
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.measurement import Values
 
@@ -25,30 +25,27 @@ from edgefilter.echo.measurement import Values
 def as_written(found: Diagnosis, prepared: Straightened, values: Mapping[str, Values], after: Comparison) -> Diagnosis:
     """The diagnosis with the values of a profile that holds all its findings, and what each leaves then."""
     before = replace(describe(prepared, prepared.model), warnings=found.comparison.warnings)
-    model, excess_db = prepared.model, before.excess_db
+    steps = steps_of(prepared.of, prepared.model, {one.effect: values[one.effect] for one in in_order(found.ranking)})
+    excess_db = [before.excess_db, *(step.score.excess_db for step in steps[:-1]), after.excess_db]
     findings: dict[str, Finding] = {}
-    for finding in in_order(found.ranking):
-        name, whole = finding.effect, before.excess_db
-        model = model.with_effect(name, values[name])
-        last = len(findings) == len(found.ranking) - 1
-        left_db = after.excess_db if last else prepared.of(model).excess_db
-        share = max(share_of(whole, left_db) - share_of(whole, excess_db), 0.0)
+    for finding, (was_db, left_db) in zip(in_order(found.ranking), pairwise(excess_db), strict=False):
+        name = finding.effect
+        share = max(share_of(before.excess_db, left_db) - share_of(before.excess_db, was_db), 0.0)
         findings[name] = replace(
             finding,
-            excess_before_db=excess_db,
+            excess_before_db=was_db,
             excess_after_db=left_db,
             share=share,
             parameters={key: interval.at(values[name][key]) for key, interval in finding.parameters.items()},
             evidence=evidence_of(name, values[name], prepared.model, finding.evidence),
             values=values[name],
         )
-        excess_db = left_db
     return replace(
         found,
         comparison=before,
         ranking=tuple(findings[finding.effect] for finding in found.ranking),
         remaining_db=after.excess_db,
-        model=model,
+        model=steps[-1].model if steps else prepared.model,
         precision=found.precision.at(values),
         written=after,
     )
@@ -94,7 +91,7 @@ def conclude(
         if findings
         else comparison.independence,
         precision=precision(found, findings),
-        advice=(*advice(tried), *asks(tried)),
+        advice=asks(tried),
         law=law_of(found),
     )
 

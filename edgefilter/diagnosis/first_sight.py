@@ -9,7 +9,7 @@ import numpy as np
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.ordinary import p_value
 from edgefilter.diagnosis.straightened import Straightened
-from edgefilter.echo.effect import Effect, vanishes
+from edgefilter.echo.effect import vanishes
 from edgefilter.echo.effects.catalogue import EFFECTS
 from edgefilter.echo.effects.gain_fit import EXCERPT, excerpt
 from edgefilter.echo.recording import BLOCK
@@ -24,7 +24,10 @@ def at_first_sight(recording: Straightened, criteria: Criteria) -> dict[str, flo
     part = _loudest(recording)
     before, turned = (part.of(part.model, any_volume).level_db for any_volume in (False, True))
     found = {"volume": before - turned}
-    for effect in (each for each in EFFECTS if each.free or each.stage == "noise" or _is_response(each)):
+    for effect in EFFECTS:
+        # another impulse response is as free as a law, and longer than that of the linear path
+        if not (effect.free or effect.stage == "noise" or (effect.stage == "response" and not effect.event)):
+            continue
         try:
             values = part.model.fitted(effect.name, part.measurement)
         except (UsageError, ArithmeticError, np.linalg.LinAlgError):
@@ -38,11 +41,6 @@ def at_first_sight(recording: Straightened, criteria: Criteria) -> dict[str, flo
     if p_value("volume", found["volume"]) > criteria.false_rate:
         del found["volume"]
     return dict(sorted(found.items(), key=lambda entry: -entry[1]))
-
-
-def _is_response(effect: Effect) -> bool:
-    """Whether an effect is another impulse response: as free as a law, and longer than that of the linear path."""
-    return effect.stage == "response" and effect.flexible and not effect.event
 
 
 def _loudest(recording: Straightened) -> Straightened:

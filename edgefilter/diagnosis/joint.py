@@ -13,9 +13,6 @@ from edgefilter.echo.effects.catalogue import find, names
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
 
-WORTH = 0.02
-"""Part of the squared error (0.1 dB) by which a round has to lower it to be followed by another: less is not heard."""
-
 
 def fit_jointly(measurement: Measurement, model: EchoModel, wanted: Sequence[str]) -> EchoModel:
     """The model with those effects, each fitted with the others in place, in turn, until the error no longer falls.
@@ -29,7 +26,7 @@ def fit_jointly(measurement: Measurement, model: EchoModel, wanted: Sequence[str
         error = measurement.error(measurement.predicted(model)[0])
         if error < least:
             best, before, least = model, least, error
-            if error < (1.0 - WORTH) * before:
+            if 10 ** (Criteria.worth_db / 10) * error < before:
                 continue
         break
     return best

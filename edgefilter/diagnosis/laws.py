@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import asdict, dataclass, field, replace
+from functools import reduce
 
 import numpy as np
 
 from edgefilter.diagnosis.criteria import Criteria
-from edgefilter.diagnosis.ordinary import p_value
-from edgefilter.diagnosis.trials import AHEAD, Found, Reading, Trial, added
-from edgefilter.echo.effect import vanishes
+from edgefilter.diagnosis.select import without_superfluous
+from edgefilter.diagnosis.trials import AHEAD, Found, Reading, Trial, Workbench, added
 from edgefilter.echo.effects.catalogue import EFFECTS, find
 from edgefilter.echo.effects.free_laws import FreeLaw
 from edgefilter.echo.measurement import Values
-from edgefilter.errors import UsageError
 
 MOST = 2
 """Laws at once: a bound on the work."""
@@ -130,62 +129,36 @@ def with_laws(
     to be there, has to predict more than they do. It is preferred only where it explains much more. What the law makes
     superfluous is dropped. None is looked for where the names leave as little as those of right ones do.
     """
+    bench = Workbench(found.recording, criteria, progress, without, found.start)
     for _ in range(MOST):
         left = max(found.final.over_db - found.final.floor_db, 0.0)
         if found.final.excess_db <= (criteria.little_db if found.steps else criteria.explained_db):
             break
         names = {step.name for step in found.steps}
-        if not (tried := list(_trials(found, progress, without))):
-            break
-        tried = [law for law in tried if law.gain_db >= criteria.part * left]
+        tried = [law for law in _trials(bench, found, without) if law.gain_db >= criteria.part * left]
         instead = [law for law in tried if not names <= dict(law.model.effects).keys()]
-        beside = [law for law in tried if law not in instead and law.p_value <= criteria.false_rate]
+        beside = [law for law in tried if law not in instead and bench.admissible(law)]
         most = criteria.nearly * max((law.gain_db for law in (*instead, *beside)), default=0.0)
         choices = [law for law in beside if law.gain_db >= most] or [*instead, *beside]
         if not choices:
             break
-        best = max(choices, key=lambda law: law.gain_db)
-        found = _with(found, _without_superfluous(found, best, criteria))
+        law = max(choices, key=lambda law: law.gain_db)
+        found = _with(found, replace(law, model=without_superfluous(bench, found.start, law.model, law.name)))
     return found
 
 
-def _trials(found: Found, progress: Callable[[str], None] | None, without: Collection[str]) -> Iterator[Trial]:
+def _trials(bench: Workbench, found: Found, without: Collection[str]) -> Iterator[Trial]:
     """Each law beside all names, and in place of those of its family; how much more it explains than all names."""
-    names = tuple(step.name for step in found.steps)
     for effect in EFFECTS:
         if not effect.free or effect.name in {AHEAD, *without, *dict(found.model.effects)}:
             continue
-        if progress:
-            progress(f"trying {effect.title}")
-        others = tuple(name for name in names if find(name).free or find(name).family != effect.family)
-        for kept in dict.fromkeys((names, others)):
-            if tried := _tried(found, effect.name, kept):
-                yield tried
-
-
-def _tried(found: Found, name: str, kept: Iterable[str]) -> Trial | None:
-    """A law fitted beside some of the names; None where its fit finds nothing."""
-    others, known = found.start, dict(found.model.effects)
-    for other in kept:
-        others = others.with_effect(other, known[other])
-    try:
-        values = found.recording.fitted(name, others)
-    except (UsageError, ArithmeticError, np.linalg.LinAlgError):
-        return None
-    if vanishes(find(name), values):
-        return None
-    model = others.with_effect(name, values)
-    return Trial.of(name, model, found.final, found.recording.of(model))
-
-
-def _without_superfluous(found: Found, law: Trial, criteria: Criteria) -> Trial:
-    """The law without the names beside which it explains no more than by chance."""
-    for name in added(found.start, law.model)[:-1]:
-        *kept, _ = added(found.start, law.model)
-        alone = _tried(found, law.name, [other for other in kept if other != name])
-        if alone and p_value(name, law.gain_db - alone.gain_db) > criteria.false_rate:
-            law = alone
-    return law
+        family = [
+            step.name for step in found.steps if not find(step.name).free and find(step.name).family == effect.family
+        ]
+        others = reduce(bench.less, family, found.model)
+        for kept in dict.fromkeys((found.model, others)):
+            if tried := bench.attempt(effect.name, kept):
+                yield Trial.of(effect.name, tried.model, found.final, tried.score)
 
 
 def _with(found: Found, law: Trial) -> Found:

@@ -85,8 +85,7 @@ class Candidate:
     """An effect that was tried, whatever came of it; why: in words.
 
     gain_db: by which it lowers the held-out level beside nothing else; beside_db: beside the others that were found;
-    None where it was not fitted there. numbers: how many of its own carry its fit. delta_bic: the change of the Bayesian
-    information criterion on the samples held out; the lower, the better. rank: by that, from 1.
+    None where it was not fitted there. rank: by the first of them that is known, from 1.
     """
 
     effect: str
@@ -94,8 +93,6 @@ class Candidate:
     why: str
     gain_db: float | None = None
     beside_db: float | None = None
-    numbers: float | None = None
-    delta_bic: float | None = None
     rank: int | None = None
 
 

@@ -7,13 +7,13 @@ something simpler, or dropped.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator
 from itertools import pairwise
 
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.ordinary import p_value
 from edgefilter.diagnosis.straightened import Straightened
-from edgefilter.diagnosis.trials import Found, Trial, Workbench, added, noisy
+from edgefilter.diagnosis.trials import Found, Trial, Workbench, added, noisy, steps_of
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
 
@@ -83,10 +83,14 @@ def refit(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
 
 def backward(bench: Workbench, start: EchoModel, model: EchoModel, newest: str) -> EchoModel:
     """The model without what the newest effect has made superfluous: an earlier one exchanged for the one to name beside it, or dropped."""
-    earlier = [name for name in added(start, model) if name != newest]
-    for name in earlier:
+    for name in [name for name in added(start, model) if name != newest]:
         model = _exchange(bench, start, model, name)
-    for name in [name for name in earlier if name in dict(model.effects)]:
+    return without_superfluous(bench, start, model, newest)
+
+
+def without_superfluous(bench: Workbench, start: EchoModel, model: EchoModel, newest: str) -> EchoModel:
+    """The model without each effect that the newest one, fitted anew in its absence, makes up for but for chance."""
+    for name in [name for name in added(start, model) if name != newest]:
         alone = bench.attempt(newest, bench.less(bench.less(model, name), newest))
         if alone is None:
             continue
@@ -159,17 +163,18 @@ def _in_steps(bench: Workbench, start: EchoModel, model: EchoModel) -> tuple[Tri
     """
     found = added(start, model)
     missed = sorted(found, key=lambda name: -_left_without(bench, start, model, name))
-    steps = _steps(bench, start, model, missed)
+    values = dict(model.effects)
+    steps = steps_of(bench.score, start, {name: values[name] for name in missed})
     excess = [bench.score(start).excess_db, *(step.score.excess_db for step in steps)]
     if all(after <= before for before, after in pairwise(excess)):
         return steps
-    left, order, with_them, values = list(found), [], start, dict(model.effects)
+    left, order, with_them = list(found), [], start
     while left:
         tries = {name: with_them.with_effect(name, values[name]) for name in left}
         order.append(min(tries, key=lambda name: bench.score(tries[name]).level_db))
         with_them = tries[order[-1]]
         left.remove(order[-1])
-    return _steps(bench, start, model, order)
+    return steps_of(bench.score, start, {name: values[name] for name in order})
 
 
 def _left_without(bench: Workbench, start: EchoModel, model: EchoModel, name: str) -> float:
@@ -180,13 +185,3 @@ def _left_without(bench: Workbench, start: EchoModel, model: EchoModel, name: st
         return bench.score(refit(bench, start, others)).level_db
     alone = bench.attempt(kept[0], start)
     return min(bench.score(others).level_db, alone.score.level_db if alone else float("inf"))
-
-
-def _steps(bench: Workbench, start: EchoModel, model: EchoModel, order: Sequence[str]) -> tuple[Trial, ...]:
-    """The effects that a model has and the start has not, in the order given, each with what it explains beside those before it."""
-    steps, values = [], dict(model.effects)
-    for name in order:
-        grown = start.with_effect(name, values[name])
-        steps.append(bench.beside(name, start, grown))
-        start = grown
-    return tuple(steps)

@@ -85,12 +85,9 @@ class Found:
 
     def with_only(self, values: Mapping[str, Values]) -> Found:
         """The outcome with nothing but these effects, each with what it explains beside those before it."""
-        model, score, steps = self.start, self.base, []
-        for name, of in values.items():
-            model, before = model.with_effect(name, of), score
-            score = self.recording.of(model)
-            steps.append(Trial.of(name, model, before, score))
-        return replace(self, model=model, final=score, steps=tuple(steps))
+        steps = steps_of(self.recording.of, self.start, values)
+        model, score = (steps[-1].model, steps[-1].score) if steps else (self.start, self.base)
+        return replace(self, model=model, final=score, steps=steps)
 
     @cached_property
     def in_noise(self) -> Straightened:
@@ -320,6 +317,16 @@ class Workbench:
     def less(self, model: EchoModel, name: str) -> EchoModel:
         """The model without what it has of that effect beyond the start."""
         return less(self._start, model, name)
+
+
+def steps_of(score: Callable[[EchoModel], Score], start: EchoModel, values: Mapping[str, Values]) -> tuple[Trial, ...]:
+    """Effects added to a model one after the other, each with what it explains beside those before it."""
+    steps, before = [], score(start)
+    for name, of in values.items():
+        start = start.with_effect(name, of)
+        steps.append(Trial.of(name, start, before, score(start)))
+        before = steps[-1].score
+    return tuple(steps)
 
 
 def added(start: EchoModel, model: EchoModel) -> list[str]:

@@ -19,8 +19,6 @@ Family: TypeAlias = Literal[
 ]
 """A curve that each sample goes through, a gain by level, a filter, the clock, a gain by time, noise; your own need not say."""
 FAMILIES: tuple[Family, ...] = get_args(Family)
-Experiment: TypeAlias = Literal["levels", "tone", "tail", "sweep", "place", "minute"]
-"""A recording that shows an effect: at two volumes, of a steady tone, of silence after a word, of a sweep, at another place, of a minute."""
 NEVER_S = 1e6
 """Seconds: a moment that no recording reaches, ten days, as the value of an event that does not happen."""
 NEVER_REACHED = 100.0
@@ -74,7 +72,7 @@ class Effect:
     title: how it reads inside a sentence ("a turned volume"); by default the name. complexity: of two effects that
     explain about as much the lower one is named. flexible: whether it has so many numbers that it takes up what a simpler
     effect beside it does. free: whether it is the law of a family rather than an effect (free_laws.py): no search tries it.
-    shown_by: recordings in which it differs from effects without them (diagnosis/advice.py).
+    lengthens: whether it makes a path longer than a recording teaches at first.
     """
 
     name: ClassVar[str]
@@ -91,7 +89,7 @@ class Effect:
     complexity: ClassVar[int] = 3
     flexible: ClassVar[bool] = False
     free: ClassVar[bool] = False
-    shown_by: ClassVar[tuple[Experiment, ...]] = ()
+    lengthens: ClassVar[bool] = False
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
         """The signal (n,) after the effect; x is not written to. By default x itself, as for an effect of stage "noise"."""
@@ -172,11 +170,6 @@ class Effect:
     def shows_in_silence(self) -> bool:
         """Whether silences tell it together with the voice: a gain by level behind the microphone (passed())."""
         return self.stage == "microphone" and self.family == "dynamics" and not self.event
-
-    @property
-    def lengthens(self) -> bool:
-        """Whether it makes a path longer than a recording teaches at first: many taps that show in the silence after a word."""
-        return self.flexible and "tail" in self.shown_by
 
     @property
     def learned(self) -> bool:

@@ -27,7 +27,7 @@ LINES = 10
 """Of a diagnosis as `edgefilter diagnose` prints it without --verbose: with the command typed before it half of a terminal."""
 MORE = "more        --verbose: all figures and what else was tried; --report PAGE.html: pictures and sound"
 CALIBRATE = "edgefilter calibrate --live --output robot.npz"
-HEADS = ("rank", "effect", "alone, dB", "added, dB", "numbers", "Delta BIC", "verdict")
+HEADS = ("rank", "effect", "alone, dB", "added, dB", "verdict")
 
 
 def spoken(effect: str) -> str:
@@ -290,9 +290,9 @@ def candidate_lines(tried: Sequence[Candidate]) -> list[str]:
     """Format the table of all effects that the diagnosis has tried."""
     if not tried:
         return ["tried       nothing: the residual is no louder while the robot talks than while it is silent"]
-    columns = "  {:>4} {:<20} {:>9} {:>10} {:>7} {:>9}  {}"
+    columns = "  {:>4} {:<20} {:>9} {:>10}  {}"
     table = [columns.format(*row) for row in (HEADS, *map(cells_of, tried))]
-    return ["tried       all effects, by Delta BIC; gains on held-out samples", *table]
+    return ["tried       all effects, by their gain on held-out samples", *table]
 
 
 def precision_lines(found: Precision) -> list[str]:
@@ -360,14 +360,10 @@ def _drawn(part: Correlogram) -> dict[str, object]:
 
 def cells_of(row: Candidate) -> tuple[str, ...]:
     """Format the columns HEADS of a tried effect."""
-
-    def shown(value: float | None, digits: int) -> str:
-        return "-" if value is None else f"{round(value, digits) + 0.0:.{digits}f}"
-
     verdict = row.verdict + (f": {row.why}" if row.why else "")
     rank = "-" if row.rank is None else str(row.rank)
-    gains = (shown(row.gain_db, 2), shown(row.beside_db, 2))
-    return (rank, row.effect, *gains, shown(row.numbers, 0), shown(row.delta_bic, 0), verdict)
+    gains = ("-" if db is None else f"{round(db, 2) + 0.0:.2f}" for db in (row.gain_db, row.beside_db))
+    return (rank, row.effect, *gains, verdict)
 
 
 def proof_line(proof: Proof | None, unproven: str) -> str:

@@ -14,7 +14,7 @@ import pytest
 import soundfile
 
 from edgefilter.cli import main
-from edgefilter.diagnosis.advice import asks, remaining
+from edgefilter.diagnosis.candidates import asks, remaining
 from edgefilter.diagnosis.probe import ENOUGH, SOUND_S, Answer, Explanation, menu, weights
 from edgefilter.diagnosis.recording import Recording
 from edgefilter.diagnosis.result import Candidate

@@ -180,7 +180,7 @@ def test_what_a_users_class_says_of_itself_is_kept(write):
         ("stage, event = 'microphone', True", "scales_fan"),
         ("stage, family = 'microphone', 'dynamics'", "shows_in_silence"),
         ("stage, family = 'source', 'static nonlinearity'", "learned"),
-        ("stage, flexible, shown_by = 'path', True, ('tail',)", "lengthens"),
+        ("stage, lengthens = 'path', True", "lengthens"),
         ("stage = 'microphone'", ""),
     ],
 )

@@ -35,7 +35,6 @@ class ClockDrift(Effect):
         " there"
     )
     title = "clock drift"
-    shown_by = ("minute",)
     followed = True
     complexity = 1
     parameters = (

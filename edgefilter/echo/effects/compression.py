@@ -37,7 +37,6 @@ class Compression(Effect):
     stage = "source"
     family = "dynamics"
     title = "compression"
-    shown_by = ("levels",)
     complexity = 2
     flexible = True
     parameters = (

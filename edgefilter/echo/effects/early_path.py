@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from edgefilter.echo.effect import Effect, Parameter, first, neutral, within
-from edgefilter.echo.effects.late_reverb import ADDED, fit_path, with_added
+from edgefilter.echo.effect import Parameter, first, neutral, within
+from edgefilter.echo.effects.late_reverb import ADDED, AddedResponse, fit_path
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
-from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE
 
 WITHIN = 0.8
 """Part of what is added that has come by within_ms: the rest is the fit's noise and the room's own tail."""
 
 
-class EarlyPath(Effect):
+class EarlyPath(AddedResponse):
     """h + added: another impulse response, after which the room dies away as it did.
 
     added: (k,) from h's first tap on. level_db: its energy re that of h. within_ms: the lag behind the direct sound by
@@ -22,20 +22,12 @@ class EarlyPath(Effect):
     """
 
     name = "early_path"
-    stage = "response"
-    family = "linear path"
     title = "another path from the start"
-    shown_by = ("sweep", "place")
-    complexity = 4
-    flexible = True
     parameters = (
         Parameter("level_db", "dB", -120.0, -120.0, 60.0),
         Parameter("within_ms", "ms", 0.0, -10.0, 1000.0),
         *ADDED,
     )
-
-    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        return with_added(x, values)
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """What fit_path() finds, which late_reverb shares.

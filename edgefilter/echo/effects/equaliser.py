@@ -38,7 +38,6 @@ class Equaliser(Effect):
     stage = "path"
     family = "linear path"
     title = "an equaliser or another loudspeaker"
-    shown_by = ("sweep",)
     complexity = 2
     flexible = True
     parameters = (

@@ -30,7 +30,19 @@ ADDED = Parameter("added", "1", 0.0, -1e3, 1e3), Parameter("taps", "1", 0.0, -10
 """Of an effect that changes the impulse response; taps only come from profiles of earlier versions."""
 
 
-class LateReverb(Effect):
+class AddedResponse(Effect):
+    """h + added, what `added` (k,) holds from h's first tap on, of a flexible effect on the impulse response."""
+
+    stage = "response"
+    family = "linear path"
+    complexity = 4
+    flexible = True
+
+    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
+        return with_added(x, values)
+
+
+class LateReverb(AddedResponse):
     """h + added: another impulse response, that of a longer room. Its decay gives the reverberation time.
 
     rt60_s: from the backward-integrated energy of the whole new response (Schroeder 1965, eq. 5), the first 20 ms left
@@ -39,20 +51,13 @@ class LateReverb(Effect):
     """
 
     name = "late_reverb"
-    stage = "response"
-    family = "linear path"
     title = "late reverberation"
-    shown_by = ("sweep", "tail", "place")
-    complexity = 4
-    flexible = True
+    lengthens = True
     parameters = (
         Parameter("rt60_s", "s", 0.0, 0.0, 10.0),
         Parameter("level_db", "dB", -120.0, -120.0, 40.0),
         *ADDED,
     )
-
-    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        return with_added(x, values)
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """What fit_path() finds, which early_path shares; neutral where none of it holds on other samples, or the room sounds no longer."""

@@ -38,7 +38,6 @@ class Limiter(Effect):
     stage = "source"
     family = "dynamics"
     title = "a limiter"
-    shown_by = ("levels",)
     complexity = 2
     parameters = (
         Parameter("ceiling_db", "dB re full scale", NEVER_DB, -80.0, NEVER_DB),

@@ -25,7 +25,6 @@ class MicClipping(Effect):
     stage = "microphone"
     family = "static nonlinearity"
     title = "microphone clipping"
-    shown_by = ("levels", "tone")
     complexity = 1
     memory = 0
     parameters = (

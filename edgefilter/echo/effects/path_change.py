@@ -6,8 +6,8 @@ import numpy as np
 
 from edgefilter.dsp.convolution import filtered
 from edgefilter.dsp.frames import block_power
-from edgefilter.echo.effect import NEVER_S, Effect, Parameter, first, neutral, within
-from edgefilter.echo.effects.late_reverb import ADDED, beside, with_added
+from edgefilter.echo.effect import NEVER_S, Parameter, first, neutral, within
+from edgefilter.echo.effects.late_reverb import ADDED, AddedResponse, beside, with_added
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import fit_supported
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
@@ -20,7 +20,7 @@ MARGIN = 1.5
 """Seconds at either end in which no change is looked for: it looks like a path that was another all along."""
 
 
-class PathChange(Effect):
+class PathChange(AddedResponse):
     """h until time_s, then h + added, faded over in duration_s around it; a time_s of 1e6 s is never.
 
     added: (k,) from h's first tap on. taps: (k,) lags -PRE_ROLL to k - PRE_ROLL, a filter behind h, in profiles of earlier
@@ -28,14 +28,9 @@ class PathChange(Effect):
     """
 
     name = "path_change"
-    stage = "response"
-    family = "linear path"
     run_note = "the running filter begins with the path as it was after the change"
     title = "a changed path"
-    shown_by = ("sweep", "place")
     event = True
-    complexity = 4
-    flexible = True
     parameters = (
         Parameter("time_s", "s", NEVER_S, 0.0, NEVER_S),
         Parameter("duration_s", "s", 0.01, 0.0, 10.0),

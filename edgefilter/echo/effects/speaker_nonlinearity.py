@@ -53,7 +53,6 @@ class SpeakerNonlinearity(Effect):
     stage = "source"
     family = "static nonlinearity"
     title = "loudspeaker nonlinearity"
-    shown_by = ("levels", "tone")
     flexible = True
     memory = MOTION_TAPS
     parameters = (
