@@ -139,7 +139,7 @@ class Spectra:
     averaged: int
 
 
-def spectra(measurement: Measurement, model: VoiceModel, resolution_hz: float) -> Spectra:
+def spectra(measurement: Measurement, model: VoiceModel, resolution_hz: float = 20.0) -> Spectra:
     """Auto- and cross-spectra of a model's whitened prediction and the recording over the fit samples, averaged over bands of resolution_hz."""
     n = _transformed(measurement.recording.size)
     whole = measurement.once(_spectra, model)

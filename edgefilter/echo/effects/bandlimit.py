@@ -63,7 +63,6 @@ class Bandlimit(Effect):
     stage = "path"
     family = "linear path"
     title = "a band limit"
-    shown_by = ("sweep",)
     complexity = 1
     flexible = True
     parameters = (
@@ -93,7 +92,7 @@ class Bandlimit(Effect):
         taps rather than by its law, or with something above it that no filter passes.
         """
         predicted, x = measurement.predicted(model)
-        found = spectra(measurement, model, 20.0)
+        found = spectra(measurement, model)
         turned = found.cross[:, None] * np.exp(2j * np.pi * np.outer(found.hz, DELAYS) / SAMPLE_RATE)
         turned = np.concatenate((turned.real, turned.imag))
 
@@ -123,7 +122,7 @@ class Bandlimit(Effect):
             return neutral(self)
         values: Values = {"cutoff_hz": best[0], "order": best[1], "phase": best[2], "delay": late}
         heard, plain = measurement.white_recording, self.apply(x, {**values, "taps": 0.0}, SAMPLE_RATE)
-        taps = fit_filter(x, heard - plain, measurement.weights, TAPS, LEAD, prior=np.full(TAPS, 1e-3), steps=15)
+        taps = short_filter(x, heard - plain, measurement.weights)
         passed = plain + filtered(x, taps, LEAD)
         values = {**values, "taps": np.clip(taps, -10.0, 10.0)}
         if not noisy and not _dull_above(best[0], measurement, x, passed):
@@ -153,6 +152,11 @@ class Bandlimit(Effect):
         plain[LEAD] = 1.0
         plain = self.apply(plain, {**values, "taps": 0.0}, SAMPLE_RATE)
         return {**values, "taps": (taps + plain) / gain - plain}
+
+
+def short_filter(x: Samples, target: Samples, weights: Samples) -> Array:
+    """The filter of x (n,), whitened, that explains most of a target (n,), each tap expected to be small, (TAPS,)."""
+    return fit_filter(x, target, weights, TAPS, LEAD, prior=np.full(TAPS, 1e-3), steps=15)
 
 
 def band_edge(found: Spectra) -> float | None:

@@ -16,8 +16,6 @@ from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 LOWEST_HZ, HIGHEST_HZ, QUALITIES = 60.0, 7000.0, (4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
 """Where modes are looked for."""
-BROAD_HZ = 40.0
-"""Bandwidth of a mode from which on a spectrum of 1 Hz shows all of it."""
 MODES, NEXT, LEAST_Q = 2, 0.05, 8.0
 """Modes that are looked for, the part of what the first explains that a further one must, and the least Q of each: what is
 broader, a fifth of an octave, is within what an equaliser's knots can follow."""
@@ -34,7 +32,6 @@ class ChassisResonance(Effect):
     stage = "path"
     family = "linear path"
     title = "a chassis resonance"
-    shown_by = ("sweep", "tail")
     complexity = 1
     parameters = (
         Parameter("frequency_hz", "Hz", 1000.0, 20.0, 8000.0),
@@ -57,13 +54,14 @@ class ChassisResonance(Effect):
         Neutral where what is found is too broad for a mode, or cut off by the search's bounds.
         """
         predicted, white = measurement.predicted(model)
-        coarse, fine = (spectra(measurement, model, resolution_hz) for resolution_hz in (1.0, 0.1))
+        coarse = spectra(measurement, model, 1.0)
         residual = measurement.white_recording - white
         modes: list[tuple[float, float]] = []
         columns, gains, explained = np.zeros((white.size, 0), np.float32), np.zeros(0), 0.0
         for _ in range(MODES):
             frequency, q = _search(_without(coarse, modes, gains))
-            mode = _refine(_without(coarse if frequency / q > BROAD_HZ else fine, modes, gains), frequency, q)
+            fine = spectra(measurement, model, min(frequency / q / 40.0, 1.0))
+            mode = _refine(_without(fine, modes, gains), frequency, q)
             if mode[1] < LEAST_Q or not LOWEST_HZ < mode[0] < HIGHEST_HZ:
                 break
             ring = _ring(predicted, *mode, SAMPLE_RATE)

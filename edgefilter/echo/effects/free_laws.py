@@ -184,7 +184,6 @@ class FreeGain(FreeLaw):
     stage: ClassVar[Stage] = "source"
     family = "dynamics"
     title = "a gain by level"
-    shown_by = ("levels",)
     parameters = (
         Parameter("loudest_db", "dB re full scale", 0.0, -100.0, 100.0),
         Parameter("gain_db", "dB", 0.0, -40.0, 40.0),  # at knots SPACING_DB apart, up to loudest_db
@@ -220,18 +219,15 @@ class FreeGain(FreeLaw):
             levels = _levels(x, settings)
             return settings[int(np.argmax([worth(*pair) for pair in zip(levels, settings, strict=True)]))]
 
-        def refined(of: Times) -> Times:
-            of = best([replace(of, attack_ms=a, release_ms=r) for a, r in product(ATTACKS_MS, RELEASES_MS)])
+        times = Times(1.0, 1.0)
+        for _ in range(2):
+            times = best([replace(times, attack_ms=a, release_ms=r) for a, r in product(ATTACKS_MS, RELEASES_MS)])
             for ratio in FINER:
                 by = (1.0 / ratio, 1.0, ratio)
-                around = [(of.attack_ms * a, of.release_ms * r) for a, r in product(by, by)]
-                of = best([replace(of, attack_ms=a, release_ms=r) for a, r in around])
-            return of
-
-        plain = refined(Times(0.0, 0.0))
-        detectors = product(AHEAD_MS, (False, True), EXPONENTS)
-        other = best([replace(plain, ahead_ms=ahead, peak=peak, exponent=e) for ahead, peak, e in detectors])
-        times = plain if other == plain else best([plain, refined(other)])
+                around = [(times.attack_ms * a, times.release_ms * r) for a, r in product(by, by)]
+                times = best([replace(times, attack_ms=a, release_ms=r) for a, r in around])
+            detectors = product(AHEAD_MS, (False, True), EXPONENTS)
+            times = best([replace(times, ahead_ms=ahead, peak=peak, exponent=e) for ahead, peak, e in detectors])
         level = _levels(ground.x, [times])[0]
         drawn = np.interp(
             np.arange(ground.x.size) / STEP, np.arange(level.size + 1), np.concatenate((level[:1], level))

@@ -11,7 +11,7 @@ import scipy
 from numpy.typing import NDArray
 
 from edgefilter.dsp.fourier import power
-from edgefilter.dsp.frames import frames
+from edgefilter.dsp.frames import block_sums, frames
 from edgefilter.dsp.psd import GRID_BINS, floored, frequencies, hann
 from edgefilter.echo.effect import NEVER_REACHED
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
@@ -25,8 +25,8 @@ SHARES = (0.3, 0.45, 0.6, 0.7, 0.8, 0.88, 0.94)
 """Thresholds to try, as the share of the displacement's peaks that stay below."""
 SIDES = (1.0, -1.0, 0.0)
 """Only pushes knock, only pulls, both."""
-DECAY_MS, DECAYS_MS = 4.0, (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
-"""Of what follows a knock: taken while the trigger is looked for, and tried then."""
+DECAYS_MS = (4.0, 1.0, 2.0, 8.0, 16.0, 32.0)
+"""Of what follows a knock: the first is taken while the trigger is looked for."""
 BETTER, LEAST = 3.0, 150.0
 """By how many times more of the log likelihood knocks must explain than noise that follows the voice's level; and how much,
 in nats, on samples that they were not learnt from."""
@@ -67,9 +67,10 @@ def find_trigger(
     for resonance in RESONANCES_HZ:
         moved = resonated(x, resonance, Q)
         for threshold in quantiles_of_peaks(moved):
-            outward, inward = (_hits(*knocks, len(power)) for knocks in knocks_at(moved, threshold))
+            outward, inward = map(_roughly_ringing, find_knocks(moved, threshold))
             for side in SIDES:
-                source = _roughly_ringing(one_side((outward, inward), side))
+                source = one_side((outward, inward), side)
+                source = source / (source.mean() + np.float32(1e-30))
                 sources = [one[use], source[use]]
                 likelihood = _likelihood(seen, sources, _colours(seen, sources, ROUNDS))
                 if likelihood > best[0]:
@@ -183,18 +184,12 @@ def band_power(x: Samples) -> Samples:
     return bins.reshape(len(bins), BANDS, -1).mean(axis=2).astype(np.float32)
 
 
-def _hits(at: NDArray[np.integer], height: Samples, frames: int) -> Array:
-    """The squared heights (k,) of knocks at samples (k,) in the hop in which each is heard, (frames + 1,)."""
-    hops = np.minimum((at + PRE_ROLL) // HOP, frames)
-    return np.asarray(np.bincount(hops, height.astype(np.float64) ** 2, frames + 1), float)
-
-
-def _roughly_ringing(hops: Array) -> Samples:
-    """Squared heights in each hop (frames + 1,), decaying, with a mean of 1, (frames, 1)."""
-    keep = np.exp(-HOP / (DECAY_MS * 1e-3 * SAMPLE_RATE))
+def _roughly_ringing(knocks: Samples) -> Samples:
+    """What ringing_of() says of knocks (n,), hop by hop, in each frame, (frames, 1)."""
+    hops = block_sums(np.concatenate((np.zeros(PRE_ROLL), knocks.astype(np.float64) ** 2))[: knocks.size], HOP)
+    keep = np.exp(-HOP / (DECAYS_MS[0] * 1e-3 * SAMPLE_RATE))
     rung = scipy.signal.lfilter([1.0], [1.0, -keep], hops)
-    both = rung[:-1] + rung[1:]
-    return (both / (both.mean() + 1e-30)).astype(np.float32)[:, None]
+    return (rung[:-1] + rung[1:]).astype(np.float32)[:, None]
 
 
 def _colours(power: Samples, sources: Sequence[Samples], rounds: int) -> list[Samples]:

@@ -23,10 +23,8 @@ FINER = np.array([0.91, 0.95, 1.0, 1.05, 1.1])
 """Times the best of these, which are tried next."""
 DELAYS = np.arange(-24.0, 25.0)
 """Samples: the lag at which such a recording is found is that of its loudest band."""
-THRESHOLDS_DB, SLOPE = (-6.0, -15.0, -25.0), 0.5
-"""Starting points, relative to the loudest 20 ms of the reference in each band, and dB per dB."""
-RELEASE_MS = 150.0
-RESOLUTION_HZ = 20.0
+STARTS = tuple(product((-6.0, -15.0, -25.0), (0.5,), np.log([8.0]), np.log([150.0])))
+"""Thresholds in dB re the loudest 20 ms of the reference in each band, slopes, attack and release as of `compression`, to start from."""
 _EACH = np.ones(BANDS)
 REACH = Reach(
     nudge=np.concatenate((0.5 * _EACH, 0.03 * _EACH, [0.15, 0.15])),
@@ -49,7 +47,6 @@ class MultibandCompression(Effect):
     stage = "source"
     family = "dynamics"
     title = "multi-band compression"
-    shown_by = ("levels", "sweep")
     flexible = True
     parameters = (
         Parameter("crossover_hz", "Hz", 1000.0, 20.0, 7500.0),
@@ -74,7 +71,7 @@ class MultibandCompression(Effect):
 
         Neutral where the bands do not pay.
         """
-        crossed = find_crossovers(spectra(measurement, model, RESOLUTION_HZ))
+        crossed = find_crossovers(spectra(measurement, model))
         if crossed is None:
             return neutral(self)
         low, high, delay = crossed
@@ -85,7 +82,7 @@ class MultibandCompression(Effect):
             return BandCompressor(values, SAMPLE_RATE).bands(_moved(x, delay))
 
         fit = GainFit(measurement, model, parts, REACH)
-        found = fit.best([_start(fit.loud_db, db, SLOPE) for db in THRESHOLDS_DB])
+        found = fit.best([_start(fit.loud_db, *start) for start in STARTS])
         if found is None:
             return neutral(self)
         makeup_db = np.clip(20.0 * np.log10(np.maximum(fit.gains(found[0]), 1e-2)), -MOST_DB, MOST_DB)
@@ -190,10 +187,10 @@ def _halves(hz: Array, crossover_hz: float) -> tuple[NDArray[np.complex128], NDA
     return low, high
 
 
-def _start(loud_db: float, below_db: float, slope: float) -> Array:
+def _start(loud_db: float, below_db: float, slope: float, attack: float, release: float) -> Array:
     """Unknowns: the bands of speech are some 0, 5 and 15 dB under the whole."""
     thresholds = loud_db + below_db - np.array([0.0, 5.0, 15.0])
-    return np.concatenate((thresholds, slope * _EACH, np.log([8.0, RELEASE_MS])))
+    return np.concatenate((thresholds, slope * _EACH, (attack, release)))
 
 
 def _values(unknowns: Array) -> dict[str, float | Array]:

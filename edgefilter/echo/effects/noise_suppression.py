@@ -32,9 +32,6 @@ FEWEST_LOUD, FEWEST_QUIET = 30, 16
 LEAST_SOFTER_DB = 2.0
 """By which the silences are under the calibrated fan at least, from day to day it is half a dB, and by which the weakest
 voice is let through less: behind a softer fan that is as predicted to half a dB."""
-MISSED_DB = -4.5
-"""Of the loud cells of the voice, which a suppressor lets through, three in four are predicted but for less: where they are
-not, a drift or what else is in the recording may take the weak cells away as well."""
 
 
 class NoiseSuppression(Effect):
@@ -87,13 +84,13 @@ class NoiseSuppression(Effect):
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Least squares over the cells, the fan's variance 1 in each: the gains at the knots times what the loud cells of the band have.
 
-        Neutral where silences and weak voice are not softer than calibrated, or the loud cells not as predicted.
+        Neutral where silences and weak voice are not softer than calibrated.
         """
         if measurement.noise_psd is None:
             return neutral(self)
         voice = measurement.predicted(model)[0]
         cells = Cells(measurement, voice, measurement.weights > 0.0)
-        if cells.quiet_db > -LEAST_SOFTER_DB or cells.missed_db > MISSED_DB:
+        if cells.quiet_db > -LEAST_SOFTER_DB:
             return neutral(self)
         *parts, last = hats(cells.ratio_db, KNOTS_DB)
         knots = len(parts)
@@ -120,7 +117,7 @@ class Cells:
 
     ratio_db: of voice to fan. power: of the voice as loud cells of its band have it. cross: of that and the recording, real
     part; all (cells,). quiet_db: level of the recording while the robot is silent, of all samples, 0 where that is too
-    seldom. missed_db: what three in four loud cells differ by less than from what is predicted, re that.
+    seldom.
     """
 
     def __init__(self, measurement: Measurement, voice: Samples, among: NDArray[np.bool_]) -> None:
@@ -132,7 +129,7 @@ class Cells:
         x, y = (spectra / np.sqrt(HOP * fan) for spectra in (x, y))
         self.quiet_db = _quiet_db(x, y)
         x, y = x[whole], y[whole]
-        ratio_db, power, cross, missed = [], [], [], []
+        ratio_db, power, cross = [], [], []
         for low, high in zip(EDGES[:-1], EDGES[1:], strict=True):
             own, both = np.abs(x[:, low:high]) ** 2, (np.conj(x[:, low:high]) * y[:, low:high]).real
             level = local_db[:, low:high]
@@ -142,9 +139,6 @@ class Cells:
                 ratio_db.append(level.ravel())
                 power.append(scale**2 * own.ravel())
                 cross.append(scale * both.ravel())
-                strange = np.abs(y[:, low:high] - scale * x[:, low:high])[loud] ** 2
-                missed.append(strange / (scale**2 * own[loud]))
-        self.missed_db = float(decibels(np.quantile(np.concatenate(missed), 0.75))) if missed else np.inf
         self.ratio_db, self.power, self.cross = (
             np.concatenate(parts) if parts else np.zeros(0) for parts in (ratio_db, power, cross)
         )

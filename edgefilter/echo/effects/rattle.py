@@ -63,7 +63,6 @@ class Rattle(Effect):
     stage = "source"
     family = "additive noise"
     title = "a rattle"
-    shown_by = ("levels", "tone")
     memory = 2048
     parameters = (
         Parameter("threshold", "full scale", NEVER_REACHED, 1e-5, NEVER_REACHED),
@@ -127,8 +126,8 @@ class Rattle(Effect):
                 break
         halves = np.arange(x.size) // FOLD % 2 == 0
         worth = WORTH * sounds.size * float(np.dot(rest, rest)) / max(float(measurement.weights.sum()), 1.0)
-        if not told and gain <= _explained([predicted * measurement.weights], rest, 2 * TAPS)[0]:
-            return neutral(self)
+        if not told:  # as long a filter of the voice must not do as much
+            worth = max(worth, _explained([predicted * measurement.weights], rest, 2 * TAPS)[0])
         if gain <= worth or not _predicts([(k * halves, k * ~halves) for k in knocks_of(at)], rest, measurement, model):
             if not told:
                 return neutral(self)
