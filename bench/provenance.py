@@ -27,6 +27,7 @@ from edgefilter.profile.data import Profile
 
 DIAGNOSIS = "diagnosis"
 """Stands among the systems for the names and values that the diagnosis finds."""
+_judged: dict[str, str | None] = {}
 LEARNING = "-learning"
 """Ends the names of systems that learn, which takes half of all the time here: they are judged by one demonstration."""
 
@@ -46,9 +47,6 @@ def stamp(
     data, systems = dict(data or {}), list(systems)
     files = models_of(systems) | {name: path for name, path in (models or {}).items() if path is not None}
     commit, dirty = results.revision()
-    # a runtime that begins here, such as LiveKit's, could not be used by workers that are forked
-    with ProcessPoolExecutor(1) as apart:
-        judged = apart.submit(behaviour, systems).result()
     return {
         "command": command(data, files),
         "commit": commit,
@@ -57,7 +55,7 @@ def stamp(
             {"what": w, "folder": p.resolve().name, **results.digest(p)} for w, paths in data.items() for p in paths
         ],
         "models": {name: results.digest(path) for name, path in files.items()},
-        "judged": judged,
+        "judged": behaviour(systems),
         "machine": results.machine(),
         "date": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
     }
@@ -149,5 +147,12 @@ def _of_diagnosis() -> str:
 
 
 def behaviour(systems: Iterable[str]) -> dict[str, str]:
-    """The digests of those that can run, by name."""
-    return {name: digest for name in systems if (digest := digest_of(name)) is not None}
+    """The digests of those that can run, by name, each found once, in another process.
+
+    A runtime that begins here, such as LiveKit's, could not be used by workers that are forked.
+    """
+    systems = list(systems)
+    if new := [name for name in systems if name not in _judged]:
+        with ProcessPoolExecutor(1) as apart:
+            _judged.update(zip(new, apart.map(digest_of, new)))
+    return {name: digest for name in systems if (digest := _judged[name]) is not None}
