@@ -35,9 +35,9 @@ COARSE_MARGIN = 400
 """Samples, 25 ms, by which the reference is read earlier than at a coarse lag, so that a canceller holds all that arrives, and
 from which on a coarse lag is another one."""
 SHOWN, UNSEEN = 1.7, 0.5
-"""What a measurement that sees the robot where it is expected says for that delay in log odds, which one that no longer sees it there takes
-off again, and what one takes off where none has seen it so far; below 0 the delay is looked for anew. In 40 measured rooms, beside humans
-and noise, measurements at the right delay see the robot in 47 %, at a wrong one in 9 %."""
+"""Log odds of a delay: a measurement that sees the robot at it adds SHOWN. One that does not takes off SHOWN, or UNSEEN while none has seen
+it there so far. Below 0 the delay is looked for anew. In 40 measured rooms, beside humans and noise, measurements at the right delay see
+the robot in 47 %, at a wrong one in 9 %."""
 SUREST = math.log(CERTAIN) + SHOWN
 """Log odds of a delay at which the robot was just seen: four measurements in a row that do not see it bring them below 0."""
 

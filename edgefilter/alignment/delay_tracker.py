@@ -29,8 +29,8 @@ EARLY = (48, 400)
 SMALL = 8.0
 """Samples of a jump up to which it may also be a wrong slope, and is half as likely as to any other lag within REACH."""
 CHANCE = 2.47
-"""Evidence by which a jump gets e times as likely. In 7 minutes of human speech while the reference played unheard, looks that agree had
-up to 19, with exponential tails: a jump that is certain, of 30, comes about once in 100 hours of such speech."""
+"""Evidence that makes a jump e times as likely. In 7 minutes of human speech, while the reference was played but not heard, looks that agreed
+had an evidence of up to 19, with exponential tails. So that of a certain jump, 30, comes about once in 100 hours of such speech."""
 ONE_LOOK = math.log(CERTAIN * 2 * REACH)
 """Logarithm of the likelihood ratio that one look shows at most, with which a jump within REACH is as good as certain: what is heard in an
 eighth of a second through a microphone that is processed may agree with the reference at any delay."""
@@ -39,8 +39,8 @@ FORGET = 0.7
 HEARD = 6.0
 """Strength of a look's peak over the rms of +-REACH lags from which it counts."""
 STRANGE = 10.0
-"""Ratio, 10 dB, of the microphone's power to that of the expected echo from which on what is heard is somebody else, and below whose
-inverse it is not the robot that was heard before: neither shows a jump."""
+"""Ratio, 10 dB, of the microphone's power to that of the expected echo. Above it somebody else is heard, below its inverse it is not the
+robot that was heard before: neither shows that the delay has jumped."""
 DRIFTED = 1.5
 """Samples of a sudden error up to which it is put down to the drift, buffers that are lost or repeated have more, and within which
 two looks see the same jump."""

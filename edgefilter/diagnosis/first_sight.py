@@ -25,7 +25,7 @@ def at_first_sight(recording: Straightened, criteria: Criteria) -> dict[str, flo
     before, turned = (part.of(part.model, any_volume).level_db for any_volume in (False, True))
     found = {"volume": before - turned}
     for effect in EFFECTS:
-        # another impulse response is as free as a law, and longer than that of the linear path
+        # another impulse response fits as much as any law may, and has more taps than the linear path here
         if not (effect.free or effect.stage == "noise" or (effect.stage == "response" and not effect.event)):
             continue
         try:

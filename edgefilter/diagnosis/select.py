@@ -89,7 +89,7 @@ def backward(bench: Workbench, start: EchoModel, model: EchoModel, newest: str) 
 
 
 def without_superfluous(bench: Workbench, start: EchoModel, model: EchoModel, newest: str) -> EchoModel:
-    """The model without each effect that the newest one, fitted anew in its absence, makes up for but for chance."""
+    """The model without each effect that it does not need: without it the newest effect, fitted anew, explains as much, within chance."""
     for name in [name for name in added(start, model) if name != newest]:
         alone = bench.attempt(newest, bench.less(bench.less(model, name), newest))
         if alone is None:

@@ -18,7 +18,7 @@ DOWN, UP = 4, 32
 """Frames of a crossfade to a cheaper engine (64 ms, since it has to bring relief), and to a better one (0.5 s, since an
 engine with a memory starts empty and has to settle while it is still quiet)."""
 JUDGE = "crnn"
-"""The engine whose network judges speech beside an engine that does not judge it."""
+"""The engine whose network says whether a human speaks where the running engine cannot say it."""
 
 
 @dataclass(frozen=True, slots=True)

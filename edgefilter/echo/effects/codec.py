@@ -39,7 +39,8 @@ PLACES = ((7, 15), (13, 7), (3, 41))
 """Frames of 8 ms and bins of 31 Hz around a cell within which a change of the voice is one complex gain: a path that moves, a
 gain that changes, a clock that trembles."""
 SHIFTS, SHIFTED = range(3, 17), (1, 41)
-"""Bins by which a sound that is modulated comes back beside itself, either way, and the place around a cell for that."""
+"""Bins between a sound and its sidebands where it is modulated, on either side; and the frames and bins around a cell for that
+comparison."""
 HEARD = 2.0
 """Times the fan that the residual around a cell, or the voice, must have to say something."""
 FOLLOWS = 0.4

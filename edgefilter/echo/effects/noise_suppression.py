@@ -82,9 +82,9 @@ class NoiseSuppression(Effect):
         return lambda x, heard=None: x
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """Least squares over the cells, the fan's variance 1 in each: the gains at the knots times what the loud cells of the band have.
+        """Gains at the knots, relative to those of the band's loud cells, by least squares over cells in which the fan has a variance of 1.
 
-        Neutral where silences and weak voice are not softer than calibrated.
+        Neutral, 0 dB everywhere, where silences and weak voice are not softer than calibrated.
         """
         if measurement.noise_psd is None:
             return neutral(self)
