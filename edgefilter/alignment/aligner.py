@@ -13,8 +13,8 @@ import numpy as np
 from edgefilter.alignment.belief import LOOK, Belief, believed
 from edgefilter.alignment.coarse_lag import CoarseLag
 from edgefilter.alignment.delay_line import HALF_WIDTH, WAIT, DelayBuffer, kernel_table, read_delayed, read_line
-from edgefilter.alignment.delay_tracker import DRIFTED, STRANGE, STRIDE, DelayMeasurement, DelayMeter, DriftFilter
-from edgefilter.alignment.lag_search import CERTAIN, EVEN, MINIMUM, MOST_LAG_S, SAME, WINDOW, Found, LagSearch
+from edgefilter.alignment.delay_tracker import DRIFTED, FAINT, SIZE, STRIDE, DelayMeasurement, DelayMeter, DriftFilter
+from edgefilter.alignment.lag_search import ALIKE, CERTAIN, EVEN, MINIMUM, MOST_LAG_S, SAME, Found, LagSearch
 from edgefilter.alignment.utterances import AHEAD, Announcements, FirstSounds, OnsetDetector, Playback, Utterance
 from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, AlignmentCounts, AlignmentState, AlignmentStats, Samples
@@ -31,15 +31,18 @@ after its echo, and the longest lag; one beyond MOST_LAG_S is reported to the us
 LOOKS, FIRST_LOOK = 12, SAMPLE_RATE // 2
 """Looks that are remembered, and samples of an utterance after which there is one; each LOOK another, and one more at each realignment.
 Speech that begins while the reference is silent waits for as long until it is nobody's but a human's: the reference may follow."""
+SEARCH_STRIDE = 768
+"""Samples between two searches of the whole range."""
 COARSE_MARGIN = 400
 """Samples, 25 ms, by which the reference is read earlier than at a coarse lag, so that a canceller holds all that arrives, and
 from which on a coarse lag is another one."""
-SHOWN, UNSEEN = 1.7, 0.5
-"""Log odds of a delay: a measurement that sees the robot at it adds SHOWN. One that does not takes off SHOWN, or UNSEEN while none has seen
-it there so far. Below 0 the delay is looked for anew. In 40 measured rooms, beside humans and noise, measurements at the right delay see
-the robot in 47 %, at a wrong one in 9 %."""
-SUREST = math.log(CERTAIN) + SHOWN
-"""Log odds of a delay at which the robot was just seen: four measurements in a row that do not see it bring them below 0."""
+THERE, UNSEEN, SUREST = 1.7, 0.5, 6.0
+"""What a look that sees the robot where it is expected adds to the log odds of the delay, what one that does not takes off, and the most
+that they become. In 40 measured rooms, beside humans and noise, looks at the right delay see it in 47 %, at a wrong one in 9 %."""
+LOST_BLOCKS, NEARBY_SEARCHES = 3, 10
+"""Measurements in speech without a credible peak after which all lags are searched again, so often as if the present delay
+had ceased SIZE samples ago, which finds jumps of up to 200 ms, then as if the utterance had begun half a second before. A delay
+that no measurement has ever seen is doubted once it is more likely wrong than right, from the beginning of the utterance on."""
 
 
 class Past(NamedTuple):
@@ -112,10 +115,7 @@ class Aligner:
         """What an arrival looks like from now on: the microphones' impulse responses (taps,); None: anything."""
         self._responses = responses
         self._lags = LagSearch(self._max_lag, responses or (), LATE, (FURTHEST, LATEST, LATEST + LOOK))
-        self._meter = self._new_meter()
-
-    def _new_meter(self) -> DelayMeter:
-        return DelayMeter(None if self._responses is None else self._responses[self._used[0]])
+        self._meter = DelayMeter(None if responses is None else responses[self._used[0]])
 
     def reset(self) -> None:
         """Forget everything, as after construction."""
@@ -136,13 +136,13 @@ class Aligner:
         self._next_look = self._looked = 0
         self._belief = believed(self._looks)
         self._read_at, self._wait = float("nan"), 0
-        self._to_measure = STRIDE // 2
+        self._to_search, self._to_measure = SEARCH_STRIDE, STRIDE // 2
         self._gain: float | None = None
         self._by_bands = None if self._calibrated else CoarseLag(self.hop, self._max_lag)
         self._coarse = False  # whether a lag is followed at which nothing sharp arrives
         self._margin = PRE_ROLL
-        self._known = self._refuted = self._measured = False
-        self._log_odds = 0.0  # of the delay; below 0 also where none is known and an utterance was not heard
+        self._known = self._refuted = self._trusted = self._measured = self._missed = False
+        self._log_odds, self._lost = -SUREST, 0
         self._counts = AlignmentCounts(
             utterances=0, realignments=0, jumps=0, searches=0, announced=0, announced_heard=0
         )
@@ -152,7 +152,7 @@ class Aligner:
         self._mics += [DelayBuffer(self._ref.capacity) for _ in range(len(self._mics), max(used) + 1)]
         first, self._used = self._used[0], list(used)
         if self._responses is not None and self._used[0] != first:
-            self._meter = self._new_meter()
+            self._meter = DelayMeter(self._responses[self._used[0]])
 
     def announce(self, utterance: Samples) -> bool:
         """Say what will be played (n,); it may begin at any time or never, and several are played in the order of announcing.
@@ -179,7 +179,7 @@ class Aligner:
             self._counts["utterances"] += 1
             self._next_look = self._ref.end + FIRST_LOOK
             if self._expected is not None:
-                self._steps, self._expected = iter(()), None
+                self._steps, self._to_search, self._expected = iter(()), 0, None
         if self._open:
             self._expire()
         before, switched, self._measured = self._read_at, False, False
@@ -234,7 +234,7 @@ class Aligner:
             return False
         self._coarse, self._margin = True, COARSE_MARGIN
         self._meter = DelayMeter()
-        self._drift.restart(float(found))
+        self._drift.restart(float(found), 3.0)
         return True
 
     def history(self, count: int) -> Samples:
@@ -274,7 +274,7 @@ class Aligner:
             return "idle"
         if self._open and self._known:
             return "lost"
-        return "locked" if self._known and self._log_odds >= 0.0 else "unfound"
+        return "unfound" if self._missed or not self._known else "locked"
 
     def _audible(self) -> bool:
         """Whether something of the reference can still be heard."""
@@ -285,20 +285,23 @@ class Aligner:
         """Give up utterances that would have been heard by now."""
         end = self._open[1].start if len(self._open) > 1 else self._onsets.current.end
         if self._ref.end > end + self._likely:
-            self._log_odds = min(self._log_odds, -SHOWN)
+            self._missed = True
             if not self._known and self._responses is not None:  # it may stand elsewhere than where it was calibrated
                 self._steps = iter(())
                 self._listen_for(None)
         if self._ref.end > end + self._latest:
-            self._resolve()
+            self._resolve(found=False)
+            self._missed = True
 
-    def _resolve(self) -> None:
+    def _resolve(self, found: bool = True) -> None:
         self._open.popleft()
+        self._trusted = found
         self._steps = iter(())
-        self._refuted = False
+        self._refuted = self._missed = False
 
     def _search(self) -> bool:
         """A step of a search over all lags each hop, to be looked at by itself or for an utterance; True if the delay was switched."""
+        self._to_search -= self.hop
         if self._measured:
             return False
         switched = next(self._steps, None)
@@ -306,14 +309,17 @@ class Aligner:
             now = self._ref.end
             heard = now - self._onsets.current.end <= FURTHEST  # as long as it may be, however late
             due = heard and now >= self._next_look and not self._follows(self._state())
-            self._next_look += LOOK * due
+            if due:
+                self._next_look += LOOK
+            elif self._to_search > 0:
+                return False
             self._steps = self._look_anywhere() if due else self._look_for_utterance()
             switched = next(self._steps, None)
         return bool(switched)
 
     def _look_anywhere(self) -> Iterator[bool]:
         """Look at the latest sound and suppose nothing of it; a step at a time."""
-        sounds = self._ref.end - self._onsets.current.end <= STRIDE
+        sounds = self._ref.end - self._onsets.current.end <= SEARCH_STRIDE
         self._lags.prepare(self._ref, self._ref.end)
         yield False
         self._lags.listen({0: self._mics[self._used[0]]}, self._ref.end, self._looked)
@@ -326,8 +332,7 @@ class Aligner:
         # so that the next search uses sound that this one has not used
         self._looked = self._ref.end + min(found.lag, 0)
         sure = -WAIT <= found.lag <= self._max_lag and self._certain(found)
-        doubted = not self._known or self._displaced or (bool(self._open) and self._open[0].lost)
-        yield sure and doubted and bool(self._open) and self._take(found)
+        yield sure and bool(self._open) and not self._known and self._take(found)
 
     def _look_for_utterance(self) -> Iterator[bool]:
         """Look for the oldest unresolved utterance, or an announced one, a step at a time, each with whether the delay was switched.
@@ -336,17 +341,19 @@ class Aligner:
         """
         now = self._ref.end
         self._expected = None if self._open else self._announced.expected(now)
-        # it was lost a short while ago, and so has jumped a short while ago
-        if self._open and self._open[0].lost and self._gain is not None and now < self._open[0].end + FIRST_LOOK:
-            self._open[0].start = now - int(self._drift.delay) - WINDOW // 2
-        too_soon = self._open and now + 2 * self.hop - self._open[0].start < MINIMUM
+        too_soon = self._open and now + 2 * self.hop - self._open[0].start < MINIMUM and not self._open[0].nearby
         if too_soon or (not self._open and self._expected is None):
             return
+        self._to_search = SEARCH_STRIDE
         self._counts["searches"] += 1
+        if self._open and self._open[0].nearby > 0:
+            self._open[0].nearby -= 1
+            before = SIZE if self._open[0].nearby else SAMPLE_RATE // 2
+            self._open[0].start = now - int(self._drift.delay) - before
         ref = self._expected or self._ref
         self._lags.prepare(ref, now, self._expected.start if self._expected else self._open[0].start)
         yield False
-        heard_out = self._open[0].after + int(self._drift.delay) if self._open and self._probability > 0.5 else 0
+        heard_out = self._open[0].after + int(self._drift.delay) if self._open and self._trusted else 0
         together = self._used if self._responses is not None else self._used[:1]
         self._lags.listen({at: self._mics[at] for at in together}, self._ref.end, heard_out)
         yield False
@@ -357,9 +364,9 @@ class Aligner:
                 yield self._take(found)
                 return
             yield False
-            # a path without an arrival errs alike in every window, and where samples are missing earlier ones had other lags
-            alone = self._coarse or self._belief.lossy > 1.0
-            if not found.old or found.odds <= (1.0 if alone else 1.0 / CERTAIN) or (looked_back and alone):
+            # where the reference lacks samples, earlier windows had other lags
+            alike = self._responses is not None or self._coarse or self._belief.lossy > 1.0
+            if not found.old or found.odds <= (CERTAIN * ALIKE if alike else 1.0 / CERTAIN) or (alike and looked_back):
                 return
             first, looked_back = self._used[0], True
             found = self._lags.before(first, self._mics[first], ref, found)
@@ -372,13 +379,9 @@ class Aligner:
             return self._begin(self._expected.start + found.lag)
         was_refuted = self._refuted
         self._resolve()
-        same = self._known and abs(found.lag - self._drift.delay) <= SAME
-        switched = was_refuted if same else self._switch(float(found.lag))
-        if self._gain is None:  # no look has seen the robot yet: a broad arrival has no peak before its shape is known
-            drift, now = self._drift, self._ref.end
-            self._meter = self._new_meter()
-            self._meter.study(self._mics[self._used[0]], self._ref, now - WINDOW, now, drift.delay, drift.slope)
-        return switched
+        if self._known and abs(found.lag - self._drift.delay) < 24:
+            return was_refuted
+        return self._switch(float(found.lag))
 
     def _begin(self, heard_at: int) -> bool:
         """What was announced is heard since heard_at: from now on it is the reference."""
@@ -391,14 +394,15 @@ class Aligner:
     def _switch(self, delay: float) -> bool:
         if self._coarse and not math.isnan(self._read_at):  # the canceller has learned what arrives behind that lag
             self._margin = max(round(delay - self._read_at), PRE_ROLL)
+            self._meter = DelayMeter()  # the other has learned what arrives around the coarse lag
             self._gain = None
-        self._drift.restart(delay)
+        self._drift.restart(delay, 3.0)
         return self._switched()
 
     def _switched(self) -> bool:
         self._known, self._coarse = True, False
         self._counts["realignments"] += 1
-        self._refuted = False
+        self._lost, self._refuted, self._missed = 0, False, False
         self._to_measure = min(self._to_measure, 2 * self.hop)
         return True
 
@@ -412,9 +416,10 @@ class Aligner:
         self._to_measure = STRIDE
         if self._ref.end - self._drift.delay - STRIDE > self._onsets.current.end:
             return False
+        far = bool(self._lost or (self._open and self._open[0].nearby))
         mic, drift = self._mics[self._used[0]], self._drift
-        found = self._meter.measure(mic, self._ref, self._ref.end, drift.delay, drift.slope)
-        seen = found and drift.where_seen(found, found.gain if self._gain is None else self._gain)
+        found = self._meter.measure(mic, self._ref, self._ref.end, drift.delay, drift.slope, far)
+        seen = found and drift.where_seen(found, found.gain if self._gain is None else self._gain, far)
         if found is None or seen == "drowned":
             return False
         if seen == "there":
@@ -429,7 +434,7 @@ class Aligner:
             self._log_odds = math.log(CERTAIN)
             if self._open and self._ref.end - drift.delay > self._open[0].start + STRIDE:
                 self._resolve()
-            drift.step(found)
+            drift.step(found.offset, 0.3)
             return self._switched()
         if seen == "elsewhere":
             self._to_measure = STRIDE // 2
@@ -440,31 +445,39 @@ class Aligner:
         step = self._drift.delay
         self._drift.correct(found)
         self._meter.confirm(found.offset)
-        self._log_odds = SUREST
+        self._lost, self._missed = 0, False
+        self._log_odds = min(self._log_odds + THERE, SUREST)
         before = found.gain if self._gain is None else self._gain
         self._gain = before + 0.1 * (min(found.gain, 2 * before) - before)
         was_refuted = self._refuted
         heard_out = self._open and self._ref.end - self._drift.delay > self._open[0].start + STRIDE
-        if self._known and heard_out and abs(found.offset) < DRIFTED:
+        if self._known and heard_out and found.dominance < 1.01:
             self._resolve()
         return was_refuted or abs(self._drift.delay - step) > 0.5
 
     def _note_loss(self, found: DelayMeasurement) -> None:
         """Speech of the robot should be heard but is not where it was expected: in the end, search everything."""
-        if self._open or (self._gain is not None and found.gain * STRANGE < self._gain):
+        if self._open or (self._gain is not None and found.gain < FAINT * self._gain):
             return
+        self._lost += 1
         self._to_measure = STRIDE // 2
-        self._log_odds -= UNSEEN if self._gain is None else SHOWN
-        if self._log_odds < 0.0:  # where no measurement has ever seen it, the delay may be wrong from the start
-            at = self._onsets.current
-            start, end = (at.start, at.end) if self._gain is None else (self._ref.end, self._ref.end)
-            self._open.append(Utterance(start, end, lost=True))
+        self._log_odds = max(self._log_odds - UNSEEN, -SUREST)
+        if self._gain is not None and self._lost >= LOST_BLOCKS:
+            self._lost = 0
+            self._open.append(Utterance(self._ref.end, self._ref.end, nearby=NEARBY_SEARCHES, lost=True))
+        elif (
+            self._gain is None and self._log_odds < 0.0
+        ):  # a lag that no measurement has ever confirmed may be wrong from the start
+            self._open.append(Utterance(self._onsets.current.start, self._onsets.current.end, lost=True))
+        self._trusted = self._trusted and not self._open
 
     def _deliver(self, mic: Samples, before: float, switched: bool) -> Aligned:
         state, end, delay = self._state(), self._ref.end, self._drift.delay
         if not (self._known or self._coarse):
             nothing = self.history(self.hop)
-            return Aligned(nothing, math.nan, 0.0, 0.0, state, switched, self._at_any_lag(mic, nothing), self._wait)
+            return Aligned(
+                nothing, math.nan, 0.0, 0.0, state, switched, self._at_any_lag(mic, nothing, state), self._wait
+            )
         if not HALF_WIDTH // 2 < delay + self._wait < PRE_ROLL:
             self._wait = min(max(HALF_WIDTH - round(delay), 0), WAIT)
         self._read_at = max(delay + self._wait - self._margin, 0.0)
@@ -479,21 +492,21 @@ class Aligner:
         if begun and self._gain is not None and end - delay > self._open[0].start:
             brought = self._ref.read(end - round(delay) - self.hop, end - round(delay))
             heard = float(np.dot(mic, mic))  # is that 10 dB below the echo of the reference at that delay?
-            self._refuted = self._refuted or heard * STRANGE < self._gain * float(np.dot(brought, brought))
+            self._refuted = self._refuted or heard < 0.1 * self._gain * float(np.dot(brought, brought))
         if self._refuted:
             reference = np.zeros(self.hop, np.float32)
-        ppm, anywhere = -1e6 * self._drift.slope, self._at_any_lag(mic, reference)
+        ppm, anywhere = -1e6 * self._drift.slope, self._at_any_lag(mic, reference, state)
         return Aligned(reference, delay, ppm, self._probability, state, switched, anywhere, self._wait)
 
-    def _at_any_lag(self, mic: Samples, reference: Samples) -> bool:
+    def _at_any_lag(self, mic: Samples, reference: Samples, state: AlignmentState) -> bool:
         """What `Aligned` says of it, for a hop of the microphone and the reference at the delay of before.
 
         Never after an utterance that failed to arrive: the loudspeaker may be muted, or be headphones.
         """
         waits = False
-        if self._open and self._log_odds >= 0.0 and self._ref.end <= self._open[0].start + self._likely:
+        if self._open and not self._missed and self._ref.end <= self._open[0].start + self._likely:
             waits = self._refuted or not (self._coarse or self._open[0].lost)
         if self._first is None:
             return waits and self._onsets.varies and (self._refuted or not self._known)
         waits = waits or self._expected is not None
-        return self._first.step(mic, reference, self._onsets.peak, self._gain, waits)
+        return self._first.step(mic, reference, self._onsets.peak, state, waits)

@@ -29,8 +29,9 @@ EARLY = (48, 400)
 SMALL = 8.0
 """Samples of a jump up to which it may also be a wrong slope, and is half as likely as to any other lag within REACH."""
 CHANCE = 2.47
-"""Evidence that makes a jump e times as likely. In 7 minutes of human speech, while the reference was played but not heard, looks that agreed
-had an evidence of up to 19, with exponential tails. So that of a certain jump, 30, comes about once in 100 hours of such speech."""
+"""Evidence that makes a jump e times as likely; one beyond REACH is less likely than one within by CERTAIN twice. In 7 minutes of human
+speech, while the reference was played but not heard, looks that agreed had an evidence of up to 19 within REACH and 29 beyond, with
+exponential tails. So that of a certain jump, 30 or 56, comes about once in 100 hours of such speech, beyond REACH once in 50."""
 ONE_LOOK = math.log(CERTAIN * 2 * REACH)
 """Logarithm of the likelihood ratio that one look shows at most, with which a jump within REACH is as good as certain: what is heard in an
 eighth of a second through a microphone that is processed may agree with the reference at any delay."""
@@ -38,9 +39,9 @@ FORGET = 0.7
 """What is left of a suspicion after a look that saw another jump."""
 HEARD = 6.0
 """Strength of a look's peak over the rms of +-REACH lags from which it counts."""
-STRANGE = 10.0
-"""Ratio, 10 dB, of the microphone's power to that of the expected echo. Above it somebody else is heard, below its inverse it is not the
-robot that was heard before: neither shows that the delay has jumped."""
+FAINT, STRANGE, EDGE = 0.25, 10.0, 64
+"""Lower and upper limit of the microphone's power over the expected echo's, outside of which no jump can be measured, and samples
+at each end of the range in which none is believed."""
 DRIFTED = 1.5
 """Samples of a sudden error up to which it is put down to the drift, buffers that are lost or repeated have more, and within which
 two looks see the same jump."""
@@ -58,15 +59,16 @@ class DelayMeasurement:
     """What one look at a delay found.
 
     offset: delay error, samples (positive: the microphone is later). variance: of the offset, samples^2. strength: height
-    of the peak over the rms of all lags. ratio: height over the highest peak elsewhere. explained: share of the microphone's
-    whitened power that the early response explains, 0 to 1. gain: power ratio of microphone to reference; gain_there: the
-    same if the offset is true.
+    of the peak over the rms of all lags. ratio: height over the highest peak elsewhere. dominance: height over the best
+    within 2 samples of the expected delay. explained: share of the microphone's whitened power that the early response
+    explains, 0 to 1. gain: power ratio of microphone to reference; gain_there: the same if the offset is true.
     """
 
     offset: float
     variance: float
     strength: float
     ratio: float
+    dominance: float
     explained: float
     gain: float
     gain_there: float
@@ -93,6 +95,7 @@ class DelayMeter:
         self._omega_squared = np.square(self._omega)
         band = (self._omega > 2 * np.pi * 120 / 16000) & (self._omega < 2 * np.pi * 7000 / 16000)
         self._band, self._band_size = band.astype(np.float32), float(np.count_nonzero(band))
+        self._ramp = np.arange(-SIZE // 2, SIZE // 2, dtype=np.float32)
         self._framed = np.zeros((3, SIZE), np.float32)
         self._prior = np.ones(self._omega.size, np.complex64)
         self._prior_blocks = 4.0
@@ -110,15 +113,18 @@ class DelayMeter:
         self.response = self._prior
 
     def measure(
-        self, mic: DelayBuffer, ref: DelayBuffer, now: int, delay: float, slope: float
+        self, mic: DelayBuffer, ref: DelayBuffer, now: int, delay: float, slope: float, far: bool
     ) -> DelayMeasurement | None:
-        """Compare the last FRAME samples of mic with the reference at the expected delay; None where either is silent."""
+        """Compare the last FRAME samples of mic with the reference at the expected delay; None where either is silent.
+
+        far: look at 2 REACH further lags on each side as well.
+        """
         centre = delay - slope * (FRAME / 2)
         whole = round(centre)
         start = now - FRAME - REACH - whole
         x, inner, wide = self._framed
         np.multiply(mic.read(now - FRAME, now), self._window, out=x[REACH:-REACH])
-        wide[:] = ref.read(start, start + SIZE)
+        self._reference(ref, start, slope, wide)
         np.multiply(wide[REACH:-REACH], self._window, out=inner[REACH:-REACH])
         energy, drive = float(x.dot(x)), float(inner.dot(inner))
         if not (drive > FLOOR and energy > 0.0):
@@ -135,38 +141,50 @@ class DelayMeter:
         weight = self._band / (left + 0.05 * power_m + (1e-6 * power_m.max() + 1e-20))
         m *= np.conj(self.response)
         m *= weight
-        product = m * np.conj(w)
-        correlation = fourier.irfft(product, SIZE)
-        likelihood = np.concatenate((correlation[-REACH:], correlation[:REACH]))
-        overlap = _overlap(wide)
+        products, references = [m * np.conj(w)], [wide]
+        if far:
+            sides = [self._reference(ref, start + x, slope, np.empty_like(wide)) for x in (2 * REACH, -2 * REACH)]
+            before, after = (m * np.conj(fourier.rfft(side)) for side in sides)
+            products, references = [before, *products, after], [sides[0], wide, sides[1]]
+        correlation = fourier.irfft(np.array(products), SIZE)
+        likelihood = np.concatenate((correlation[:, -REACH:], correlation[:, :REACH]), axis=1).ravel()
+        overlap = np.concatenate([_overlap(reference) for reference in references])
         likelihood /= np.sqrt(overlap + 0.1 * overlap.max())
-        at = int(likelihood.argmax())
-        peak = float(likelihood[at])
-        elsewhere = max(likelihood[: max(at - NEAR, 0)].max(initial=0.0), likelihood[at + NEAR :].max(initial=0.0))
-        rms = math.sqrt(float(likelihood.dot(likelihood)) / likelihood.size)
-        there = wide[SIZE - FRAME - at : SIZE - at] * self._window
+        expected = likelihood.size // 2
+        near = float(likelihood[expected - 2 : expected + 3].max())
+        at, peak, strength, ratio = max(
+            (_highest(likelihood, reach) for reach in {REACH, expected}), key=lambda found: found[2] * found[3]
+        )
+        part, inside = divmod(at, 2 * REACH)
+        offset = at - inside + REACH - expected + climb(products[part], self._omega, inside - REACH, steps=3)
+        there = references[part][SIZE - FRAME - inside : SIZE - inside] * self._window
         information = 2.0 * float(self._omega_squared.dot(power(self.response) * power_a * weight)) * FRAME / SIZE
         explained = 1.0 - float(self._band.dot(left / (power_m + 1e-20))) / self._band_size
         return DelayMeasurement(
-            offset=climb(product, self._omega, at - REACH, steps=3),
+            offset=offset,
             variance=4.0 / (information + 1e-30) + 1e-4,
-            strength=peak / (rms + 1e-20),
-            ratio=peak / max(float(elsewhere), 1e-20),
+            strength=strength,
+            ratio=ratio,
+            dominance=peak / max(near, 1e-20),
             explained=min(max(explained, 0.0), 1.0),
             gain=energy / drive,
             gain_there=energy / (float(there.dot(there)) + 1e-30),
         )
 
+    def _reference(self, ref: DelayBuffer, start: int, slope: float, out: Samples) -> Samples:
+        """SIZE samples of the reference from start on, the drift about their middle undone by the first term of a Taylor series."""
+        x = ref.read(start - 2, start + SIZE + 2)
+        np.subtract(x[3:-1], x[1:-3], out=out)
+        out *= 8.0
+        out += x[:-4]
+        out -= x[4:]
+        out *= self._ramp * (slope / -12.0)
+        out += x[2:-2]
+        return out
+
     def confirm(self, offset: float) -> None:
         """The last measurement was believed, with this offset: `learn`, when there is time, takes it into the response."""
         self._confirmed = offset
-
-    def study(self, mic: DelayBuffer, ref: DelayBuffer, start: int, now: int, delay: float, slope: float) -> None:
-        """Learn the response from the sound up to now in which this delay was found; what the next look hears is no part of it."""
-        for end in range(start + FRAME, now - FRAME + 1, STRIDE):
-            if self.measure(mic, ref, end, delay, slope):
-                self.confirm(0.0)
-                self.learn()
 
     def learn(self) -> None:
         """Take what was confirmed last, if it has not been taken yet, into the response: its cross-spectrum, shifted by its offset."""
@@ -194,6 +212,17 @@ class DelayMeter:
         self.response = self._prior * np.float32(scale)
 
 
+def _highest(likelihood: Samples, reach: int) -> tuple[int, float, float, float]:
+    """Index of the highest peak at most reach from the middle, its height, strength and ratio among the lags there."""
+    first = likelihood.size // 2 - reach
+    inner = likelihood[first : first + 2 * reach]
+    at = int(inner.argmax())
+    peak = float(inner[at])
+    elsewhere = max(inner[: max(at - NEAR, 0)].max(initial=0.0), inner[at + NEAR :].max(initial=0.0))
+    rms = math.sqrt(float(inner.dot(inner)) / inner.size)
+    return first + at, peak, peak / (rms + 1e-20), peak / max(float(elsewhere), 1e-20)
+
+
 def _overlap(reference: Samples) -> Samples:
     """Energy of the reference's first difference under the middle half of the frame, at offsets -REACH to REACH - 1, (2 REACH,)."""
     earliest, half = FRAME // 4, FRAME // 2
@@ -215,26 +244,26 @@ class DriftFilter:
     def __init__(self) -> None:
         self.slope, self._slope_variance = 0.0, SLOPE_DEVIATION**2
         self._witness = JumpWitness()
-        self.restart(float("nan"))  # nothing is known of a delay
+        self.restart(float("nan"), float("nan"))  # nothing is known of a delay
 
     @property
     def deviation(self) -> float:
         """Standard deviation of the delay, samples."""
         return math.sqrt(self._variance)
 
-    def restart(self, delay: float, deviation: float = SMALL / EXPECTED) -> None:
-        """Another delay, known to +-deviation samples; the slope stays, the clocks are the same. A search finds it to within SMALL."""
+    def restart(self, delay: float, deviation: float) -> None:
+        """Another delay, known to +-deviation samples; the slope stays, the clocks are the same."""
         self.delay = delay
         self._variance, self._covariance = deviation**2, 0.0
         self._since = 0
         self._witness.forget()
 
-    def step(self, found: DelayMeasurement) -> None:
+    def step(self, offset: float, deviation: float) -> None:
         """The delay is another one by an offset; a small one may come from a wrong slope since the last look as well as from a jump."""
-        wrong = found.offset / max(self._since, STRIDE)
-        if abs(found.offset) <= SMALL and abs(self.slope + wrong) < UNEXPECTED * SLOPE_DEVIATION:
+        wrong = offset / max(self._since, STRIDE)
+        if abs(offset) <= SMALL and abs(self.slope + wrong) < UNEXPECTED * SLOPE_DEVIATION:
             self._slope_variance = min(self._slope_variance + wrong**2, SLOPE_DEVIATION**2)
-        self.restart(self.delay + found.offset, math.sqrt(self._noise(found)))
+        self.restart(self.delay + offset, deviation)
 
     def advance(self, samples: int) -> None:
         """Let `samples` samples pass."""
@@ -248,8 +277,8 @@ class DriftFilter:
         """The measured offset in standard deviations of what was to be expected."""
         return abs(measurement.offset) / math.sqrt(self._expected()[2] + self._noise(measurement))
 
-    def where_seen(self, found: DelayMeasurement, gain: float) -> str:
-        """Whether a look saw the robot where it was expected.
+    def where_seen(self, found: DelayMeasurement, gain: float, far: bool) -> str:
+        """Whether a look, far or not, saw the robot where it was expected.
 
         "there": it did. "elsewhere": it saw it at another delay, which is remembered; "jumped": other looks agree.
         "unseen": not at all. "drowned": somebody louder hid it. gain: power that the robot has brought so far.
@@ -261,7 +290,7 @@ class DriftFilter:
             return "there"
         if found.gain > STRANGE * gain:
             return "drowned"
-        if not 1.0 / STRANGE < found.gain_there / gain < STRANGE or size > REACH - NEAR:
+        if not FAINT < found.gain_there / gain < STRANGE or size > (3 if far else 1) * REACH - EDGE:
             return "unseen"
         return "jumped" if self._witness.convinced(found) else "elsewhere"
 
@@ -306,7 +335,7 @@ class DriftFilter:
 class JumpWitness:
     """Remembers the most suspicious jump of late, and how much more likely than chance it makes what was seen.
 
-    >>> look = DelayMeasurement(100.0, 0.01, strength=10.0, ratio=1.6, explained=0.5, gain=1.0, gain_there=1.0)
+    >>> look = DelayMeasurement(100.0, 0.01, strength=10.0, ratio=1.6, dominance=5.0, explained=0.5, gain=1.0, gain_there=1.0)
     >>> witness = JumpWitness()
     >>> witness.convinced(look), witness.convinced(look)
     (False, True)
@@ -321,7 +350,7 @@ class JumpWitness:
 
     def convinced(self, found: DelayMeasurement) -> bool:
         """Take in a look at which the delay seems to have jumped by its offset; True if that is certain now."""
-        shown = min(found.evidence / CHANCE, ONE_LOOK)
+        shown, size = min(found.evidence / CHANCE, ONE_LOOK), abs(found.offset)
         if abs(found.offset - self._offset) < DRIFTED:
             self._shown += shown
         else:
@@ -330,4 +359,5 @@ class JumpWitness:
                 return False
             self._shown = shown
         self._offset = found.offset
-        return self._shown > math.log(CERTAIN * (4 * SMALL + 1 if abs(found.offset) <= SMALL else 2 * REACH))
+        lags = 4 * SMALL + 1 if size <= SMALL else 2 * REACH if size <= REACH else CERTAIN**2 * 6 * REACH
+        return self._shown > math.log(CERTAIN * lags)

@@ -30,7 +30,9 @@ SAME = 32
 and the lags of two looks may differ by it, which is what clocks and a person who walks move it by."""
 NEAR, ASIDE = 12, 512
 """Lags on each side of a peak that belong to it, and lags on each side of the one found over which `before` correlates the
-earlier window, which lies so far ahead that one short agreement does not reach into both."""
+earlier window."""
+BETWEEN = 1024
+"""Samples between the two windows, so that one short agreement does not reach into both."""
 EVEN, STEEP, EARLY_ODDS = 1.37, 9.9, 0.05
 """Clearness of a lag that is as likely right as not, the power of it that the odds grow with, and what is left of the odds where the
 reference would come more than WAIT after its echo. Fitted to 12 minutes of robots in measured rooms, beside noise and humans
@@ -38,6 +40,10 @@ up to 5 dB louder, and as many of other speech while the robot is not heard."""
 CERTAIN = 100.0
 """Odds from which on a lag is believed, and the odds against it from which on it is given up: while a human and an unheard robot
 talk all the time, a wrong one in an hour."""
+ALIKE = 0.05
+"""Probability that all looks share one error: a reflection taken for the direct sound, a path without a sharp peak, a path that was
+calibrated elsewhere. However many there are, looks raise the odds by 1/ALIKE at most: where that may be so one earlier look
+is taken, and only for a lag with odds of CERTAIN * ALIKE or more."""
 MISSED = 0.3
 """Probability that a second with audible robot has no peak at its lag: .21 of the seconds in 19 real recordings had none."""
 
@@ -65,7 +71,7 @@ class Found:
     @property
     def old(self) -> bool:
         """Whether the utterance would have sounded for so long that the window before must show it too."""
-        return self.heard > WINDOW + 2 * ASIDE + MINIMUM
+        return self.heard > WINDOW + BETWEEN + MINIMUM
 
     @property
     def prior(self) -> float:
@@ -172,11 +178,11 @@ class LagSearch:
         return Found(lag, _clearness(score, at), self._at, heard)
 
     def before(self, number: int, mic: DelayBuffer, ref: DelayBuffer | Playback, found: Found) -> Found:
-        """The lag with its odds after a look back at the microphone's window 2 ASIDE samples before, and with that window's end.
+        """The lag with its odds after a look back at the microphone's window BETWEEN samples before, and with that window's end.
 
         No look counts for more than CERTAIN: a short sound of another may agree entirely.
         """
-        stop = found.at - WINDOW - 2 * ASIDE
+        stop = found.at - WINDOW - BETWEEN
         x = np.zeros(WINDOW + 2 * ASIDE, np.float32)
         x[ASIDE:-ASIDE] = mic.read(stop - WINDOW, stop)
         _soften(x[ASIDE:-ASIDE])
@@ -189,7 +195,7 @@ class LagSearch:
         at = ASIDE - NEAR + int(np.argmax(score[ASIDE - NEAR : ASIDE + NEAR]))
         shown = min(MISSED + _clearness(score, at) ** STEEP, CERTAIN)
         clearness = found.clearness * (min(CERTAIN / found.odds, 1.0) * shown) ** (1.0 / STEEP)
-        return Found(found.lag, clearness, stop, found.heard - WINDOW - 2 * ASIDE)
+        return Found(found.lag, clearness, stop, found.heard - WINDOW - BETWEEN)
 
     def _whitened(self, heard: Samples, reference: np.ndarray, number: int) -> np.ndarray:
         """Whitened cross-spectrum of a microphone's sound (n,) and the reference, 0 below LOWEST_HZ, without the phase of the known path."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgefilter.dsp.frames import SILENT, stretch
-from edgefilter.types import SAMPLE_RATE, Samples
+from edgefilter.types import SAMPLE_RATE, AlignmentState, Samples
 
 PAUSE = SAMPLE_RATE // 5
 """Samples of silence after which the lag may be another one: shorter than any pause between two playbacks, longer than
@@ -40,6 +40,8 @@ LONGEST = SAMPLE_RATE // 4
 rises out of digital silence counts as a voice for as long, before its level has varied."""
 USUAL = 1e-2
 """Initial peak of a voice, mean square, -20 dB: so that a soft onset does not lower the threshold."""
+LEARNING = 0.1
+"""Share of a loud hop in the running gain from the reference to the microphone."""
 
 
 @dataclass
@@ -47,12 +49,14 @@ class Utterance:
     """A stretch of speech in the reference, positions in samples; start lies up to two hops before the first sound.
 
     after: end of the one before it, which the microphone hears out first, since one loudspeaker plays them in turn.
-    lost: whether it is one that was followed and is looked for again, not one that began.
+    lost: whether it is one that was followed and is looked for again, not one that began; nearby: searches left that
+    suppose it to have jumped a short while ago, its start moving along.
     """
 
     start: int
     end: int
     after: int = NEVER
+    nearby: int = 0
     lost: bool = False
 
 
@@ -195,19 +199,21 @@ class FirstSounds:
 
     def reset(self) -> None:
         """As before the first hop."""
-        self._since = 0
+        self._gain, self._heard, self._since = self._calibrated, False, 0
 
-    def step(self, mic: Samples, explained: Samples, loudest: float, gain: float | None, waits: bool) -> bool:
+    def step(self, mic: Samples, explained: Samples, loudest: float, state: AlignmentState, waits: bool) -> bool:
         """Take a hop of the microphone and of the reference at the present delay, zeros where there is none, (hop,) each.
 
-        loudest: mean square of the reference's loudest hop. gain: power of the microphone over that of the reference, None until
-        the robot has been heard. waits: whether there is an utterance that was not found yet.
+        loudest: mean square of the reference's loudest hop. waits: whether there is an utterance that was not found yet.
         """
         power, brought = float(np.dot(mic, mic)), float(np.dot(explained, explained))
+        if state == "locked" and brought > 0.1 * self._hop * loudest:
+            self._heard = True
+            self._gain += LEARNING * (min(power / brought, 2.0 * self._gain) - self._gain)
         if not waits:
             self._since = 0
             return False
-        least = LOUD * self._hop * (max(loudest, USUAL) if gain is None else loudest)
-        if self._since or power > (self._calibrated if gain is None else gain) * max(least, EXPLAINED * brought):
+        least = LOUD * self._hop * (loudest if self._heard else max(loudest, USUAL))
+        if self._since or power > self._gain * max(least, EXPLAINED * brought):
             self._since += self._hop
-        return 0 < self._since <= (np.inf if gain is None else LONGEST)
+        return 0 < self._since <= (LONGEST if self._heard else np.inf)

@@ -139,10 +139,10 @@ def test_soft_first_sounds_of_a_calibrated_voice_make_nobody_loud():
 
 def test_from_the_first_sample_on_and_until_nothing_is_waited_for():
     first, loud = FirstSounds(1, np.ones(1)), np.ones(1, np.float32)
-    told = [first.step(loud, 0 * loud, 0.0, None, waits) for waits in (True, False, True)]
+    told = [first.step(loud, 0 * loud, 0.0, "begun", waits) for waits in (True, False, True)]
     assert told == [True, False, True]
-    assert not first.step(loud, loud, 0.0, None, False)
-    assert not first.step(loud, loud, 1.0, None, True)  # the present delay explains it
+    assert not first.step(loud, loud, 0.0, "locked", False)
+    assert not first.step(loud, loud, 1.0, "begun", True)  # the present delay explains it
 
 
 @pytest.mark.parametrize(("engine", "least_db"), [("crnn", 20.0), ("ss", 15.0), ("linear", 10.0)])
