@@ -27,7 +27,6 @@ from edgefilter.profile.data import Profile
 
 DIAGNOSIS = "diagnosis"
 """Stands among the systems for the names and values that the diagnosis finds."""
-_judged: dict[str, str | None] = {}
 LEARNING = "-learning"
 """Ends the names of systems that learn, which takes half of all the time here: they are judged by one demonstration."""
 
@@ -146,13 +145,17 @@ def _of_diagnosis() -> str:
     return hashlib.sha256(repr((found.verdict, said)).encode()).hexdigest()[:16]
 
 
+_found: dict[str, str | None] = {}
+"""Digests by system that `behaviour` has had made."""
+
+
 def behaviour(systems: Iterable[str]) -> dict[str, str]:
     """The digests of those that can run, by name, each found once, in another process.
 
     A runtime that begins here, such as LiveKit's, could not be used by workers that are forked.
     """
     systems = list(systems)
-    if new := [name for name in systems if name not in _judged]:
+    if new := [name for name in systems if name not in _found]:
         with ProcessPoolExecutor(1) as apart:
-            _judged.update(zip(new, apart.map(digest_of, new)))
-    return {name: digest for name in systems if (digest := _judged[name]) is not None}
+            _found.update(zip(new, apart.map(digest_of, new)))
+    return {name: digest for name in systems if (digest := _found[name]) is not None}

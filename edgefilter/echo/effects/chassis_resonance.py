@@ -16,6 +16,8 @@ from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 LOWEST_HZ, HIGHEST_HZ, QUALITIES = 60.0, 7000.0, (4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
 """Where modes are looked for."""
+SHOWN = 40.0
+"""Points of a spectrum within a mode's bandwidth, with which all of the mode shows; the coarse spectrum of 1 Hz has as many from 40 Hz on."""
 MODES, NEXT, LEAST_Q = 2, 0.05, 8.0
 """Modes that are looked for, the part of what the first explains that a further one must, and the least Q of each: what is
 broader, a fifth of an octave, is within what an equaliser's knots can follow."""
@@ -60,7 +62,7 @@ class ChassisResonance(Effect):
         columns, gains, explained = np.zeros((white.size, 0), np.float32), np.zeros(0), 0.0
         for _ in range(MODES):
             frequency, q = _search(_without(coarse, modes, gains))
-            fine = spectra(measurement, model, min(frequency / q / 40.0, 1.0))
+            fine = spectra(measurement, model, min(frequency / q / SHOWN, 1.0))
             mode = _refine(_without(fine, modes, gains), frequency, q)
             if mode[1] < LEAST_Q or not LOWEST_HZ < mode[0] < HIGHEST_HZ:
                 break
