@@ -4,11 +4,10 @@ evaluate   every system on conversations and on real recordings: words, SI-SDR, 
 devices    every real device in one table, a row a device
 passport   how far a passport's prediction is from what humans have on real devices
 latency    milliseconds of a hop, alone and beside a learner; CPU over a long time
-live       trials on virtual devices: conversations, barge-in, an hour without a break
+live       on virtual devices and in closed loop: an hour without a break, barge-in, a click
 diagnosis  how often hidden effects are named, and what naming them brings
 training   what chooses a network: words on validation speakers, the scale of the speech probability
 serve      streams that a core serves in real time
-fuzz       damaged profiles, models and recordings; hostile clients
 mutate     whether the tests notice a change in the code
 count      lines, and numbers that have a name, by folder
 stale      which results are of another behaviour than today's; exit 1 if there are any

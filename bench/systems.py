@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,18 +23,13 @@ from bench import closed_loop, detectors, peers, results, voicefilter
 from bench.closed_loop import Output, recorded
 from bench.detectors import DETECTORS
 from bench.recordings import Clip, NotHere, Signals
-from edgefilter import EgoFilter, PathLearner, Profile, calibrate
-from edgefilter.calibration.calibrate import FARTHEST
+from edgefilter import EgoFilter, PathLearner, Profile
 from edgefilter.closed_loop import ASK_DB
-from edgefilter.dsp.fractional_delay import delayed
-from edgefilter.dsp.lag import correlation_near, flat_cross, highest, top
-from edgefilter.dsp.metrics import si_sdr
-from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines import HAVE_MODEL, create
 from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.filter.budget import versions
 from edgefilter.filter.echo_path import FilteredHop, Learner, PathState, PathUpdate
-from edgefilter.types import SAMPLE_RATE, Samples, SoundFor
+from edgefilter.types import SAMPLE_RATE, SoundFor
 
 OWN = ("linear", "ss", "crnn")
 WAYS = {"": "calibrated", "-learning": "calibrated and learning", "-uncalibrated-learning": "learning only",
@@ -200,23 +196,13 @@ def _asked() -> System:
 
 
 def _arrays() -> list[System]:
-    """Rows of `crnn` with several microphones: streamed, the finished turns, and what is made of them as one."""
-    found, late = [], _latency_ms("crnn")
-
-    def add(name: str, title: str, run: Callable[[Clip], Output], knows: str, latency_ms: float | None = late) -> None:
-        code = partial(_engine_code, "crnn")
-        found.append(System(f"crnn-{name}", f"crnn{title}", "own", run, knows, latency_ms, code=code))
-
-    for count in ARRAYS:
-        for way in ("", "-learning"):
-            told, knows = f", {count} microphones, {WAYS[way]}", WAYS[way] if way else "calibration"
-            streamed, finished = (partial(_of_array, count, bool(way), turns) for turns in (False, True))
-            add(f"{count}{way}", told, streamed, knows)
-            add(f"{count}-turns{way}", f"{told}, finished turns", finished, knows, None)
-        told = f" on {count} microphones, delayed and summed towards the human, calibrated"
-        add(f"sum-of-{count}", told, partial(_of_sum, count), "the truth")
-        told = f" on the best of {count} microphones, by SI-SDR, calibrated"
-        add(f"best-of-{count}", told, partial(_of_best, count), "the truth")
+    """Rows of `crnn` with several microphones: streamed, and the finished turns."""
+    found, late, code = [], _latency_ms("crnn"), partial(_engine_code, "crnn")
+    for count, way in product(ARRAYS, ("", "-learning")):
+        told, knows = f"crnn, {count} microphones, {WAYS[way]}", WAYS[way] if way else "calibration"
+        for kind, title, latency_ms in (("", told, late), ("-turns", f"{told}, finished turns", None)):
+            run = partial(_of_array, count, bool(way), bool(kind))
+            found.append(System(f"crnn-{count}{kind}{way}", title, "own", run, knows, latency_ms, code=code))
     return found
 
 
@@ -243,38 +229,6 @@ def _of_array(count: int, learning: bool, turns: bool, clip: Clip) -> Output:
     for turn in (event.turn for event in found.events or () if event.turn):
         samples[turn.start : turn.start + turn.samples.size] = turn.samples
     return found._replace(samples=samples)
-
-
-def _calibrated(clip: Clip, mic: Samples, sweep: Samples, fan: Samples) -> Output:
-    """What `crnn` makes of a microphone (n,), calibrated with what it heard of the sweep and of the fan."""
-    profile = calibrate(clip.source.read("sweep_ref"), sweep, fan)
-    return run_engine(Row("crnn", True, False), Signals(mic, clip.ref), profile)
-
-
-def _of_sum(count: int, clip: Clip) -> Output:
-    """What `crnn` makes of the microphones' sum, the human (by the truth) in step in all of them."""
-    clip.array(count)
-    clean = clip.source.read_all("clean")[clip.span, :count].T
-    size = 2 * clean.shape[1]
-    cross = [flat_cross(clean[0], one, size) for one in clean]
-    late = [top(each, size, highest(correlation_near(each, size, FARTHEST))[0]) for each in cross]
-
-    def summed(name: str) -> Samples:
-        sound = clip.source.read_all(name)[:, :count].T
-        return np.mean([delayed(one, max(late) - its) for one, its in zip(sound, late)], axis=0).astype(np.float32)
-
-    output = _calibrated(clip, summed("mic"), summed("sweep_mic"), summed("fan_only"))
-    back = round(max(late))  # in step with the first microphone again
-    return output._replace(samples=np.concatenate((output.samples[back:], np.zeros(back, np.float32))))
-
-
-def _of_best(count: int, clip: Clip) -> Output:
-    """What `crnn` makes of the one of the microphones, each calibrated, with the highest SI-SDR: the truth chooses."""
-    clip.array(count)
-    mic, sweep, fan = (clip.source.read_all(name)[:, :count].T for name in ("mic", "sweep_mic", "fan_only"))
-    clean, span = clip.source.read_all("clean").T, clip.span
-    outputs = [_calibrated(clip, *heard) for heard in zip(mic, sweep, fan)]
-    return outputs[int(np.argmax([si_sdr(one.samples[span], clean[at, span]) for at, one in enumerate(outputs)]))]
 
 
 def _engine_code(engine: str, model: Path | None = None) -> str:
@@ -397,24 +351,8 @@ def _behind(base: System, name: str, held: bool) -> System:
     return System(f"{base.name}+{name}{'-held' * held}", title, "detector", run, base.knows, None, missing, code)
 
 
-def linear(clip: Clip) -> Samples:
-    """What our linear stage leaves, (n,), with a calibration where there is one; computed once for a clip."""
-    wanted = Row("linear", clip.profile is not None, False)
-    return clip.once("linear", lambda: run_engine(wanted, clip.signals, clip.profile).samples)
-
-
 def _bounds() -> list[System]:
-    mask = partial(_engine_code, "linear")
     return [
         System("clean", "The human alone", "bound", lambda clip: Output(clip.known_human())),
         System("fan-kept", "Echo gone, fan kept", "bound", lambda clip: Output(clip.known_human() + clip.fan())),
-        System("ideal-mask", "Ideal mask on what linear leaves", "bound", ideal_mask, "calibration if any", code=mask),
     ]
-
-
-def ideal_mask(clip: Clip) -> Output:
-    """What the linear stage leaves, each bin at the human's magnitude where that is less."""
-    config = StftConfig()
-    error, human = (voicefilter.analysed(config, x) for x in (linear(clip), clip.known_human()))
-    gain = np.minimum(np.abs(human) / np.maximum(np.abs(error), 1e-9), 1.0)
-    return Output(voicefilter.synthesised(config, gain * error, clip.mic.size))

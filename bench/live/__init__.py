@@ -1,13 +1,12 @@
-r"""Robots that talk, move and are interrupted: on virtual devices in real time, and over minutes and hours of recordings.
+r"""Robots that talk and are interrupted: on virtual devices in real time, and over minutes and hours of recordings.
 
-    python -m bench live trial --voices ROBOT/test --speech HUMAN/test --whisper WHISPER --output bench/results/live
     python -m bench live soak --minutes 60                    faster than real time; --one-way: the clocks go on drifting
     python -m bench live hour --minutes 60                    the same on virtual devices
     python -m bench live click                                from a click to the filtered click
     python -m bench live barge-in --voices ROBOT/test --speech HUMAN/test --count 24 --seed 17 \
         --whisper WHISPER --alone ROBOT/test SYNTHESIZERS --minutes 60 --real RECORDINGS
 
-trial, hour and click need PulseAudio, whose private servers make no sound. What each part does stands at the head of its
+hour and click need PulseAudio, whose private servers make no sound. What each part does stands at the head of its
 file in bench/live/. All parts write to the one file of --output.
 """
 
@@ -16,10 +15,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bench.live import barge_in, click, soak, trial
+from bench.live import barge_in, click, soak
 from edgefilter.errors import UsageError
 
-PARTS = {"trial": trial.run, "barge-in": barge_in.run, "soak": soak.run, "hour": soak.run, "click": click.run}
+PARTS = {"barge-in": barge_in.run, "soak": soak.run, "hour": soak.run, "click": click.run}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> str:
-    for name in ("voices", "speech") if options.part in ("trial", "barge-in") else ():
+    for name in ("voices", "speech") if options.part == "barge-in" else ():
         if getattr(options, name) is None:
             raise UsageError(f"the part '{options.part}' needs --{name}, a folder with a transcripts.tsv")
     return PARTS[options.part](options)

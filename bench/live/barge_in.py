@@ -49,7 +49,7 @@ from bench.metrics import (
 from bench.recogniser import Recogniser, normalise, word_errors
 from bench.recordings import CALIBRATION, find_recordings, progress
 from bench.simulate.conversations import Scene, make_scene, read_clips, read_voices
-from bench.simulate.robot_day import STARTS, Monologue, make_monologue
+from bench.simulate.monologues import STARTS, Monologue, make_monologue
 from edgefilter.calibration.calibrate import calibrate
 from edgefilter.filter.barge_in import BargeIn, BargeInSettings
 from edgefilter.profile.data import Profile

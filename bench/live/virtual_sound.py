@@ -1,4 +1,4 @@
-"""A private PulseAudio or PipeWire with null sinks or piped sources, seen by PortAudio through ALSA by their and their monitors' names."""
+"""A private PulseAudio or PipeWire with null sinks, seen by PortAudio through ALSA by their and their monitors' names."""
 
 from __future__ import annotations
 
@@ -17,18 +17,12 @@ SYSTEMS = ("pulseaudio", "pipewire")
 
 @dataclass
 class Server:
-    """A running server, with all that it consists of, the environment that leads to it, and its lines of ALSA's configuration."""
+    """A running server, with all that it consists of, and the environment that leads to it."""
 
     process: subprocess.Popen
     environment: dict
-    devices: str
     system: str = "pulseaudio"
     others: list[subprocess.Popen] = field(default_factory=list)
-
-    def add(self, other: Server) -> None:
-        """Let those who use this server see the other's devices too."""
-        with open(self.environment["ALSA_CONFIG_PATH"], "a") as configuration:
-            configuration.write(other.devices)
 
     def stop(self) -> None:
         for process in (self.process, *self.others):
@@ -36,43 +30,35 @@ class Server:
             process.wait()
 
 
-def start_server(
-    folder: Path, sinks: Sequence[str] = SINKS, sources: Sequence[str] = (), system: str = SYSTEMS[0], channels: int = 1
-) -> Server:
+def start_server(folder: Path, sinks: Sequence[str] = SINKS, system: str = SYSTEMS[0], channels: int = 1) -> Server:
     """Start a server whose files all lie in folder and wait until its devices are there.
 
-    The first sink is the default output, the last one's monitor the default microphone. sources: microphones that hear
-    what is written into folder/NAME, 16-bit at 16 kHz, when it is written; a sink has a clock of its own, which stands
-    still and jumps where programs come and go. channels: of the sinks.
+    The first sink is the default output, the last one's monitor the default microphone. channels: of the sinks.
     """
     pulse = system == "pulseaudio"
     socket = f"unix:{folder}/{'socket' if pulse else 'pulse/native'}"
     environment = {**os.environ, "HOME": str(folder), "XDG_RUNTIME_DIR": str(folder)}
     environment |= {"PULSE_RUNTIME_PATH": str(folder / "pulse"), "DBUS_SESSION_BUS_ADDRESS": f"unix:path={folder}/bus"}
     modules = [f"module-null-sink sink_name={name} rate=16000 format=s16le channels={channels}" for name in sinks]
-    for name in sources:
-        (folder / name).unlink(missing_ok=True)
-        modules += [f"module-pipe-source source_name={name} file={folder / name} rate=16000 format=s16le channels=1"]
     start = _start_pulseaudio if pulse else _start_pipewire
     process, *others = start(folder, environment, modules)
     environment |= {"PULSE_SERVER": socket, "ALSA_CONFIG_PATH": str(folder / "asound.conf"), "OMP_NUM_THREADS": "1"}
     if not pulse:
         _load(modules, environment, process)
-    names = {name: name for name in (*sinks, *sources)} | {f"{name}_monitor": f"{name}.monitor" for name in sinks}
+    names = {name: name for name in sinks} | {f"{name}_monitor": f"{name}.monitor" for name in sinks}
     entries = [f'pcm.{pcm} {{ type pulse\n server "{socket}"\n device "{device}" }}\n' for pcm, device in names.items()]
     usual = [f'pcm.{pcm} {{ type pulse\n server "{socket}" }}\n' for pcm in ("!default", "pulse")]
     (folder / "asound.conf").write_text("</usr/share/alsa/alsa.conf>\n" + "".join(entries + usual))
     for _ in range(300):
         listed = subprocess.run(["pactl", "list", "short"], env=environment, capture_output=True, text=True)
-        if all(f"\t{name}\t" in listed.stdout for name in (*sinks, *sources)):
-            if sinks:
-                subprocess.run(["pactl", "set-default-sink", sinks[0]], env=environment, check=True)
-                subprocess.run(["pactl", "set-default-source", f"{sinks[-1]}.monitor"], env=environment, check=True)
-            return Server(process, environment, "".join(entries), system, others)
+        if all(f"\t{name}\t" in listed.stdout for name in sinks):
+            subprocess.run(["pactl", "set-default-sink", sinks[0]], env=environment, check=True)
+            subprocess.run(["pactl", "set-default-source", f"{sinks[-1]}.monitor"], env=environment, check=True)
+            return Server(process, environment, system, others)
         if process.poll() is not None:
             break
         time.sleep(0.1)
-    Server(process, environment, "", system, others).stop()
+    Server(process, environment, system, others).stop()
     raise RuntimeError(f"{system} did not start:\n" + (folder / "log").read_text())
 
 

@@ -109,14 +109,9 @@ def test_rows_with_several_microphones_run_where_there_are_so_many(made: tuple, 
     rows = systems.catalogue()
     assert np.allclose(clip.mic, signals["mic"][:, 0], atol=1e-4)
     assert clip.text == meta["text"] and clip.span == slice(meta["start"], meta["end"])
-    outputs = {
-        name: rows[name].run(clip) for name in ("crnn", "crnn-3", "crnn-3-turns", "crnn-sum-of-2", "crnn-best-of-2")
-    }
+    outputs = {name: rows[name].run(clip) for name in ("crnn", "crnn-3", "crnn-3-turns")}
     assert all(output.samples.size == clip.mic.size for output in outputs.values())
     assert not np.array_equal(outputs["crnn"].samples, outputs["crnn-3"].samples)
-    clean = signals["clean"][clip.span, 0]
-    found = {name: si_sdr(output.samples[clip.span], clean) for name, output in outputs.items()}
-    assert found["crnn-best-of-2"] > min(found["crnn"], 0.0) and found["crnn-sum-of-2"] > found["crnn"] - 6.0
     with pytest.raises(NotHere, match="3 microphones, expected 4"):
         rows["crnn-4"].run(clip)
     with pytest.raises(NotHere, match="1 microphones, expected 2"):

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import time
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +12,11 @@ import soundfile
 from bench import __main__ as bench
 from bench import closed_loop
 from bench.closed_loop import Output
-from bench.live import barge_in, click, soak, trial
+from bench.live import barge_in, click, soak
 from bench.live.barge_in import early_errors, lasts, lowered, muted, silent_at, words
 from bench.metrics import first_sound
 from bench.recogniser import Recogniser
-from bench.simulate import robot_day
+from bench.simulate import monologues
 from bench.simulate.conversations import Scene, make_scene, read_clips, read_voices
 from bench.simulate.simulated_robot import Room, draw_robot, draw_walls, stand
 from edgefilter import Event
@@ -34,19 +32,13 @@ def run(output: Path, part: str, *arguments: object) -> tuple[dict, str]:
 
 
 def test_a_part_says_which_folder_it_needs(clips: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert bench.main(["live", "trial", "--voices", str(clips)]) == 1
-    assert capsys.readouterr().err == "bench live: the part 'trial' needs --speech, a folder with a transcripts.tsv\n"
+    assert bench.main(["live", "barge-in", "--voices", str(clips)]) == 1
+    assert (
+        capsys.readouterr().err == "bench live: the part 'barge-in' needs --speech, a folder with a transcripts.tsv\n"
+    )
 
 
 # ---------------------------------------------------------------- long recordings
-
-
-def test_clips_repeat_only_after_all_were_said(clips: Path) -> None:
-    repertoire = robot_day.Repertoire(robot_day.shuffled(np.random.default_rng(0), read_clips(clips, (1.0, 15.0))))
-    said = [next(repertoire) for _ in range(9)]
-    assert len({x.tobytes() for x in said[:6]}) == 6
-    assert [seconds for _, seconds in repertoire.said] == [x.size / RATE for x in said]
-    assert len(set(repertoire.said)) == 6
 
 
 def test_an_utterance_is_in_the_echo_after_the_lag_at_its_volume_and_by_its_clock() -> None:
@@ -54,9 +46,8 @@ def test_an_utterance_is_in_the_echo_after_the_lag_at_its_volume_and_by_its_cloc
     response = np.eye(1, 100)[0]
 
     def echo(**how: float) -> np.ndarray:
-        stage = robot_day.Stage("", Room(0.2, response, response), **{"lag": 800, **how})
-        voice = iter([babble(3.0, 1).astype(float)])
-        return robot_day.speak(np.random.default_rng(0), robot, voice, stage, 1.0)[1]
+        voice, room = iter([babble(3.0, 1).astype(float)]), Room(0.2, response, response)
+        return monologues.speak(np.random.default_rng(0), robot, voice, 1.0, room, **{"lag": 800, **how})[1]
 
     plain = echo()
     assert not plain[: RATE // 2 + 800 + robot.bulk - 40].any() and plain.any()
@@ -73,20 +64,6 @@ def test_a_robot_driven_elsewhere_stays_in_its_room() -> None:
     here, there = (stand(rng, walls, 0.2, direction, 1.2) for _ in range(2))
     assert here.rt60_s == pytest.approx(there.rt60_s, rel=0.15) and not np.allclose(here.robot[:800], there.robot[:800])
     assert np.argmax(np.abs(here.robot)) == np.argmax(np.abs(there.robot))  # its loudspeaker went along
-
-
-def test_the_day_says_what_its_human_says_and_where(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    clips = [robot_day.Clip(tmp_path, "a", "one two"), robot_day.Clip(tmp_path, "b", "three")]
-    monkeypatch.setattr(robot_day, "read_speech", lambda clip: np.full(16_000, 0.1 if clip.speaker == "a" else 0.2))
-    room = Room(0.2, np.zeros(1), np.array([0.0, 1.0, 0.5]))
-    utterances = [slice(at, at + 60_000) for at in range(0, 2_700_000, 90_000)]
-    clean, told = robot_day.interrupt(np.random.default_rng(0), clips, room, utterances, 2_700_000)
-    assert {text for text, _ in told} == {"one two", "three"} and 1 < len(told) < len(utterances)
-    silent = np.ones(clean.size, bool)
-    for _, place in told:
-        assert abs(np.mean(clean[place] ** 2) - 1) < 0.01
-        silent[place] = False
-    assert not clean[silent].any()
 
 
 @pytest.mark.slow
@@ -151,54 +128,6 @@ def test_the_distance_between_two_clicks_is_exact() -> None:
 def test_start_of_the_program_is_timed_to_its_first_samples() -> None:
     seconds, memory_mb = click.start("ss")
     assert 0.05 < seconds and 20 < memory_mb < 200
-
-
-def test_a_sentence_is_found_where_the_recording_was_moved_and_filled() -> None:
-    rng = np.random.default_rng(5)
-    mic = np.convolve(rng.standard_normal(400_000), np.ones(8) / 8, "same").astype(np.float32)
-    sentence = mic[200_000:240_000] + 0.3 * rng.standard_normal(40_000).astype(np.float32)
-    for moved in (-30_000, 0, 91_234):
-        assert trial.located(sentence, np.roll(mic, moved), 200_000) == 200_000 + moved
-    assert trial.located(mic[:32_000], mic, 0) == 0
-
-
-@pytest.mark.slow
-def test_a_device_gives_its_sound_by_the_clock_whether_it_was_away_or_not() -> None:
-    samples = (0.1 * np.random.default_rng(1).standard_normal(20 * 16_000)).astype(np.float32)
-    command = ["timeout", "1.2", "parec", "-d", "robot_mic", "--rate=16000", "--channels=1", "--format=s16le", "--raw"]
-    with trial.Device("robot_mic", samples) as device:
-        device.play(began := time.monotonic())
-        ends = []
-        for away in (False, True):
-            if away:
-                device.unplug(), device.plug_in()
-            given = subprocess.run([*command, "--latency-msec=20"], env=device.server.environment, capture_output=True)
-            last = np.frombuffer(given.stdout[-16_000:], "<i2")
-            ends.append(trial.located(last / np.float32(32767), samples, 0) / 16_000 + 0.5 - (time.monotonic() - began))
-    assert abs(ends[0]) < 0.5 and abs(ends[1] - ends[0]) < 0.3, ends
-
-
-def test_the_trial_has_a_row_for_each_mishap_and_weighs_sentences_by_their_words() -> None:
-    sentence = {"begin_s": 61.0, "during": "office", "noticed_s": 0.2, "text": "yes", "recognised": "no"}
-    wrong = {"human alone": 0.0, "microphone": 1.0, "output": 1.0}
-    other = {"during": "cores busy", "noticed_s": None, "words": 3, "wrong": {**wrong, "output": 0.0}}
-    deadline = {"missed_deadlines": 1, "hops": 9, "steps": 0, "compute": {"p50_ms": 1.0, "p99_ms": 2.0}}
-    found = {
-        "doings": [(60.0, "cores busy, 10 s")],
-        "events": [{"time": 1.0, "kind": "started"}, *({"time": 2.0, "kind": "jump"} for _ in range(13)),
-                   {"time": 2.0, "kind": "speech_started"}],
-        "sentences": [{**sentence, "wrong": wrong, "words": 1}, {**sentence, **other}],
-        "stats": {"samples_in": 5, "samples_out": 5, "engine": "ss", "source": {"lost": 0, "microphone_gone": 1},
-                  "deadline": deadline},
-    }  # fmt: skip
-    rows = {table["name"]: table["rows"] for table in trial.tables(found)}
-    assert rows["trial"] == [
-        ["office", 1, "1 of 1", 0.0, 100.0, 100.0],
-        ["cores busy", 1, "0 of 1", 0.0, 100.0, 0.0],
-        ["all", 2, "1 of 2", 0.0, 100.0, 25.0],
-    ]
-    assert ["microphone gone", 1] in rows["trial-counts"] and rows["trial-done"] == [["1:00.0", "cores busy, 10 s"]]
-    assert rows["trial-events"] == [["0:01.0", "started", ""], ["13 times", "jump", ""]]
 
 
 # ---------------------------------------------------------------- barge-in in closed loop

@@ -1,8 +1,10 @@
 """`edgefilter serve` with a real WebSocket client: what comes out, and clients that are slow, wrong, late or gone."""
 
 import asyncio
+import contextlib
 import gc
 import json
+import random
 import resource
 import signal
 import socket
@@ -708,6 +710,41 @@ def test_a_mad_client_is_told_in_one_line_and_others_go_on(sent, words, caplog):
     told = [record.getMessage() for record in caplog.records]
     assert len(answer) > 0 and code == 1008 and any(words in line for line in (reason, *told))
     assert all(line.isprintable() for line in (reason, *told)) and not any(record.exc_info for record in caplog.records)
+
+
+FORMS = {}, {"streams": "two"}, {"streams": "two", "rate": 48000, "codec": "opus"}, {"microphones": 3}, {"learn": True}
+
+
+def test_whatever_clients_send_others_go_on(caplog):
+    """Sound of any size, labels, numbers and counters that do what they want, frames of no use, bytes that are none."""
+    rng = random.Random(1)
+
+    def anything():
+        sound = rng.randbytes(rng.choice((0, 1, 12, 640, 60_000)))
+        header = HEADER.pack(rng.choice((0, 1, 7)), rng.randrange(65536), rng.choice((0, 320, 1 << 40)))
+        said = rng.choice((sound, header + sound, b'{"kind": "announce"}', b"[" * 5000, b'{"kind": "\x1b[2J"}'))
+        return frame(rng.choice((0, 1, 2, 2, 2, 2, 9, 15)), said, fin=rng.random() < 0.9)
+
+    async def attack(address):
+        with contextlib.suppress(ConnectionClosed, TimeoutError):
+            async with connect(address, max_queue=None, close_timeout=0.1) as mad:
+                await mad.send(json.dumps(rng.choice(FORMS)))
+                mad.transport.write(b"".join(anything() for _ in range(rng.choice((1, 10, 300)))))
+                while True:
+                    await asyncio.wait_for(mad.recv(), 0.5)
+
+    async def talk():
+        async with serving("linear", streams=9) as address, connect(address) as good:
+            await good.send("{}")
+            await good.recv()
+            for _ in range(5):
+                attacks = [asyncio.create_task(attack(address)) for _ in range(8)]
+                await good.send(pcm(np.zeros((1024, 2))))
+                assert len(await good.recv()) > 0
+                await asyncio.gather(*attacks)
+
+    run(talk())
+    assert all(record.getMessage().isprintable() and not record.exc_info for record in caplog.records)
 
 
 @pytest.mark.parametrize("hello", [{"\x1b[2J\nroot": 1}, {"codec": "\x1b]0;a\x07\n"}], ids=["name", "value"])

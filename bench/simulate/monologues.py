@@ -1,0 +1,111 @@
+"""Simulated robots that speak to nobody: ever new robots in new rooms, clip after clip, from the filter's first moment on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import chain
+
+import numpy as np
+
+from bench.simulate import simulated_robot as physics
+from bench.simulate.conversations import DISTORTION_DB, Clip, read_speech
+from bench.simulate.simulated_robot import RATE, Array, Rng, Robot, Room
+from edgefilter.types import Samples
+
+PAUSE_S = (0.4, 2.0)
+END_S = 3.0
+"""Silence at the end: the echo of the last utterance dies away in it."""
+FAN_DB = -31.5
+"""Power of the fan, against the robot's (between lab and office of `conversations`)."""
+ROOMS = ("lab", "office")
+STARTS, LAG_S, PPM = ("calibrated", "cold"), (0.02, 1.0), (10.0, 300.0)
+TRIAL_S = 6.0
+"""Of the robot's voice, to which its distortion is set."""
+
+
+class Repertoire(Iterator[Array]):
+    """What the robot says: clips one after the other, each with a peak of 0.7; said: those so far, with their seconds."""
+
+    def __init__(self, clips: Iterable[Clip]) -> None:
+        self._clips = iter(clips)
+        self.said: list[tuple[Clip, float]] = []
+
+    def __next__(self) -> Array:
+        clip = next(self._clips)
+        samples = read_speech(clip)
+        self.said.append((clip, samples.size / RATE))
+        return 0.7 * samples / np.abs(samples).max()
+
+
+def speak(
+    rng: Rng, robot: Robot, repertoire: Iterator[Array], speech_s: float, room: Room, lag: int, volume_db: float = 0.0,
+    ppm: float = 0.0,
+) -> tuple[Array, Array, list[slice]]:  # fmt: skip
+    """Reference (n,), echo (n,) without gain, and where in the echo each utterance is, of so many seconds of speech."""
+    said: list[tuple[int, Array]] = []
+    at, missing = RATE // 2, speech_s * RATE
+    while missing > 0:
+        said.append((at, next(repertoire)))
+        missing -= said[-1][1].size
+        at += said[-1][1].size + int(rng.uniform(*PAUSE_S) * RATE)
+    ref, echo = np.zeros((2, at + lag + int(END_S * RATE)))
+    tail = room.robot.size + robot.bulk
+    for start, samples in said:
+        ref[start : start + samples.size] = samples
+        heard = robot.record(np.pad(10 ** (volume_db / 20) * samples, (0, tail)), room.robot)
+        place = echo[start + lag : start + lag + heard.size]
+        place += heard[: place.size]
+    later = lag + robot.bulk
+    return ref, physics.warp(echo, ppm), [slice(start + later, start + later + x.size) for start, x in said]
+
+
+@dataclass(frozen=True)
+class Monologue:
+    """One robot in one room, from the filter's first moment on.
+
+    ref, mic: (n,) float32. echo: of mic, what the robot says; late: samples by which it is later than in ref. start: whether
+    the filter has the calibration (sweep, its recording, the fan). said: clips in order, and how many seconds each.
+    """
+
+    ref: Samples
+    mic: Samples
+    echo: Samples
+    late: int
+    calibration: tuple[Samples, Samples, Samples]
+    room: str
+    distortion: str
+    start: str
+    voice: str
+    said: list[tuple[Clip, float]]
+
+
+def make_monologue(seed: int, index: int, voice: str, clips: Iterator[Clip], speech_s: float) -> Monologue:
+    """Number index of this seed: rooms, distortions, starts in turn; clocks that differ in every other eight.
+
+    The gain is one at which a sweep in that room has a peak of 0.3 of full scale, or the voice one of 0.8.
+    """
+    rng = np.random.default_rng([seed, index])
+    kind, distortion, start = ROOMS[index % 2], tuple(DISTORTION_DB)[index // 2 % 2], STARTS[index // 4 % 2]
+    robot = physics.draw_robot(rng)
+    room = physics.draw_room(rng, kind, robot.distance_m, robot.direction, rng.uniform(1.0, 1.5))
+    first = next(clips)
+    trial = read_speech(first)[: round(TRIAL_S * RATE)]
+    robot, _ = physics.with_distortion(robot, trial, room.robot, rng.uniform(*DISTORTION_DB[distortion][kind]))
+    ppm = rng.choice([-1.0, 1.0]) * math.exp(rng.uniform(*np.log(PPM))) if index // 8 % 2 else 0.0
+    lag, volume_db = round(rng.uniform(*LAG_S) * RATE), rng.uniform(-3, 3)
+    said = Repertoire(chain([first], clips))
+    ref, echo, heard = speak(rng, robot, said, speech_s, room, lag, volume_db, ppm)
+    excitation = physics.sweep()
+    swept = robot.record(excitation, room.robot)
+    gain = float(min(0.3 / np.abs(swept).max(), 0.8 / float(np.abs(echo).max())))
+    level = math.sqrt(np.mean(np.concatenate([echo[utterance] for utterance in heard]) ** 2))
+    fan, spectrum = gain * level * 10 ** (FAN_DB / 20), physics.draw_fan(rng)
+    beside, with_sweep, alone = (
+        (fan * physics.fan_noise(rng, spectrum, size)).astype(np.float32) for size in (ref.size, swept.size, 8 * RATE)
+    )
+    voiced = (gain * echo).astype(np.float32)
+    sweeps = excitation.astype(np.float32), np.float32(gain) * swept.astype(np.float32) + with_sweep, alone
+    return Monologue(ref.astype(np.float32), voiced + beside, voiced, lag + robot.bulk, sweeps, kind, distortion, start,
+                     voice, said.said)  # fmt: skip
