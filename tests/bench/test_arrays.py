@@ -13,6 +13,7 @@ from bench.recordings import NotHere
 from bench.simulate import arrays
 from bench.simulate.conversations import read_clips, read_voices, write_item
 from edgefilter.dsp.metrics import si_sdr
+from tests.bench.conftest import driven
 
 RATE = 16000
 
@@ -37,7 +38,10 @@ def covariances(tmp_path_factory: pytest.TempPathFactory) -> tuple[np.ndarray, n
 def made(clips: Path, covariances: tuple, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict, dict]:
     """A folder with one conversation of three microphones in a laboratory, its signals and what it says of itself."""
     speech, voices = read_clips(clips, (0.5, 8.0)), read_voices([clips])
-    signals, meta = arrays.make(1, 0, "paper", "lab", speech, voices, covariances, microphones=3, turns=1, moving=True)
+    with driven():
+        signals, meta = arrays.make(
+            1, 0, "paper", "lab", speech, voices, covariances, microphones=3, turns=1, moving=True
+        )
     folder = tmp_path_factory.mktemp("arrays")
     write_item(folder / "lab_00", signals, "meta", meta)
     return folder, signals, meta
@@ -91,7 +95,8 @@ def test_without_an_echo_the_same_human_and_fan_are_left(clips: Path, covariance
     _, signals, meta = made
     speech, voices = read_clips(clips, (0.5, 8.0)), read_voices([clips])
     settings = {"microphones": 3, "turns": 1, "moving": True}
-    silent, told = arrays.make(1, 0, "paper", "lab", speech, voices, covariances, **settings, echo=False)
+    with driven():
+        silent, told = arrays.make(1, 0, "paper", "lab", speech, voices, covariances, **settings, echo=False)
     for name in ("sweep_ref", "sweep_mic", "fan_only", "clean"):
         assert np.array_equal(silent[name], signals[name])
     assert not silent["ref"].any() and told["turns"] == meta["turns"] and told["snr_fan"] == meta["snr_fan"]

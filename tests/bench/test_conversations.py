@@ -107,6 +107,14 @@ def test_warp_reads_at_the_other_clock(ppm: float) -> None:
     )  # -90 dB images
 
 
+def test_the_drive_is_that_of_the_distortion_that_was_asked_for() -> None:
+    one, x, room = robot.draw_robot(np.random.default_rng(2)), babble(1.0, 1).astype(np.float64), np.eye(1, 100)[0]
+    for wanted_db in (-15.0, -25.0):
+        driven, found_db = robot.with_distortion(one, x, room, wanted_db)
+        assert found_db == pytest.approx(wanted_db, abs=0.3)
+        assert -si_sdr(driven.record(x, room), driven.record(x, room, linear=True)) == found_db
+
+
 def test_loudspeaker_is_linear_when_barely_driven_and_distorts_when_driven() -> None:
     driver, x = robot.draw_loudspeaker(np.random.default_rng(2)), babble(2.0, 1).astype(np.float64)
     distortion = [

@@ -20,7 +20,7 @@ from bench.simulate import monologues
 from bench.simulate.conversations import Scene, make_scene, read_clips, read_voices
 from bench.simulate.simulated_robot import Room, draw_robot, draw_walls, stand
 from edgefilter import Event
-from tests.bench.conftest import RATE, babble
+from tests.bench.conftest import RATE, babble, driven
 from tests.program import DEMO
 
 
@@ -135,7 +135,8 @@ def test_start_of_the_program_is_timed_to_its_first_samples() -> None:
 
 @pytest.fixture(scope="module")
 def scene(clips: Path) -> Scene:
-    return make_scene(3, 0, "live", read_clips(clips, (3.0, 12.0)), read_voices([clips]))
+    with driven():
+        return make_scene(3, 0, "live", read_clips(clips, (3.0, 12.0)), read_voices([clips]))
 
 
 @pytest.fixture(scope="module")
@@ -237,7 +238,8 @@ def test_interruptions_and_false_stops_from_end_to_end(
     monkeypatch.setattr(barge_in, "listen", listen)
     options = ["--voices", clips, "--speech", clips, "--count", 1, "--alone", clips, "--minutes", 0.05]
     options += ["--whisper", clips, "--cache", tmp_path]
-    found, page = run(tmp_path / "live", "barge-in", *options)
+    with driven():
+        found, page = run(tmp_path / "live", "barge-in", *options)
     (interruption,), (alone,) = found["conversations"], found["alone"]
     assert set(interruption["words"]) == set(barge_in.POLICIES)
     assert interruption["calibrated"]["delay_s"] == 0.1 and "| calibrated | 1 | 100 [21, 100] | 0.10 | 0.10 |" in page
