@@ -4,7 +4,7 @@ evaluate   every system on conversations and on real recordings: words, SI-SDR, 
 devices    every real device in one table, a row a device
 passport   how far a passport's prediction is from what humans have on real devices
 latency    milliseconds of a hop, alone and beside a learner; CPU over a long time
-live       on virtual devices and in closed loop: an hour without a break, barge-in, a click
+live       on virtual devices and in closed loop: an hour without a break, barge-in
 diagnosis  how often hidden effects are named, and what naming them brings
 training   what chooses a network: words on validation speakers, the scale of the speech probability
 serve      streams that a core serves in real time

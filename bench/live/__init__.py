@@ -2,11 +2,10 @@ r"""Robots that talk and are interrupted: on virtual devices in real time, and o
 
     python -m bench live soak --minutes 60                    faster than real time; --one-way: the clocks go on drifting
     python -m bench live hour --minutes 60                    the same on virtual devices
-    python -m bench live click                                from a click to the filtered click
     python -m bench live barge-in --voices ROBOT/test --speech HUMAN/test --count 24 --seed 17 \
         --whisper WHISPER --alone ROBOT/test SYNTHESIZERS --minutes 60 --real RECORDINGS
 
-hour and click need PulseAudio, whose private servers make no sound. What each part does stands at the head of its
+hour needs PulseAudio, whose private servers make no sound. What each part does stands at the head of its
 file in bench/live/. All parts write to the one file of --output.
 """
 
@@ -15,10 +14,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bench.live import barge_in, click, soak
+from bench.live import barge_in, soak
 from edgefilter.errors import UsageError
 
-PARTS = {"barge-in": barge_in.run, "soak": soak.run, "hour": soak.run, "click": click.run}
+PARTS = {"barge-in": barge_in.run, "soak": soak.run, "hour": soak.run}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--voices", type=Path, nargs="+", metavar="DIR", help="folders of the robot's sentences")
     add("--speech", type=Path, metavar="DIR", help="folder of human speech")
     add("--minutes", type=float, default=10.0, help="of the run, or of robot speech (default: %(default)s)")
-    add("--count", type=int, default=16, help="conversations or clicks (default: %(default)s)")
+    add("--count", type=int, default=16, help="conversations (default: %(default)s)")
     add("--engine", help="default: auto; of barge-in crnn")
     add("--one-way", action="store_true", help="soak: the reference's clock is fast all the time")
     uninterrupted = "barge-in: voices of robots that nobody interrupts"

@@ -33,12 +33,11 @@ from tqdm import tqdm
 from bench.simulate import conversations
 from bench.simulate import simulated_robot as physics
 from bench.simulate.conversations import Clip, Voices, read_speech, read_utterance, record_all, write_item
-from bench.simulate.simulated_robot import RATE, Array, Rng
+from bench.simulate.simulated_robot import RATE, SOUND_M_S, Array, Rng
 from edgefilter.dsp.metrics import si_sdr
 
 SIZE = 512
 """Samples of a frame of the covariances: finer than the fan's coherence changes."""
-SPEED_OF_SOUND = 343.0
 
 
 def measured_covariances(folder: Path) -> tuple[Array, Array]:
@@ -77,7 +76,7 @@ def with_microphones(covariance: Array, count: int, phase: float) -> Array:
 def parts_covariance(rng: Rng, places: Array) -> Array:
     """Covariance of near sources, a diffuse field and the microphones' own noise, (bins, m, m). places: (m, 3) m."""
     hz = np.arange(SIZE // 2 + 1) * RATE / SIZE
-    wave = 2 * np.pi * hz / SPEED_OF_SOUND
+    wave = 2 * np.pi * hz / SOUND_M_S
     count = len(places)
     total = np.zeros((hz.size, count, count), complex)
     for _ in range(3):

@@ -15,9 +15,8 @@ import pyroomacoustics as pra
 from scipy import signal
 
 from bench.simulate import simulated_robot as physics
-from bench.simulate.simulated_robot import RATE, Array, Loudspeaker, Rng
+from bench.simulate.simulated_robot import RATE, SOUND_M_S, Array, Loudspeaker, Rng
 
-SOUND_M_S = 343.0
 PHASES = 4096
 HALF_WIDTH = 32
 

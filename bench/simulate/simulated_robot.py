@@ -15,7 +15,7 @@ from scipy import signal, special
 
 from edgefilter.dsp.metrics import si_sdr
 
-RATE = 16000
+RATE, SOUND_M_S = 16000, 343.0
 OVERSAMPLING = 4
 PIECE = 1 << 14
 """Samples that are worked on at once: they stay in a processor's cache."""

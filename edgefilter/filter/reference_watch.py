@@ -19,8 +19,8 @@ from edgefilter.dsp.lag import one_signal
 from edgefilter.filter.microphones import SILENT
 from edgefilter.filter.playback_faults import AHEAD, BEHIND, CLEAR, LENGTH, STEP, other_rates, speeds
 from edgefilter.filter.removal import Removal
-from edgefilter.filter.robot_sound import LOUD, RobotSound
-from edgefilter.filter.volume import pre_emphasised
+from edgefilter.filter.robot_sound import RobotSound
+from edgefilter.filter.volume import AUDIBLE, pre_emphasised
 from edgefilter.types import SAMPLE_RATE, EventKind, Frame, Samples
 
 OTHERS = 0.2
@@ -196,7 +196,7 @@ class ReferenceWatch:
             self._sound.forget()
         if aligned.state in ("locked", "coarse") and not speaking:
             brought = float(aligned.reference.dot(aligned.reference)) / self._hop
-            if brought > LOUD * aligned.past.onsets.peak:
+            if brought > AUDIBLE * aligned.past.onsets.peak:
                 self._played += 0.01 * (brought - self._played) if self._played else brought
                 self._sound.learn(fourier.power(frame.mic))
         lag = LOOK if math.isnan(aligned.delay) else int(aligned.delay)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from edgefilter.dsp.psd import mel_edges
+from edgefilter.filter.volume import AUDIBLE
 from edgefilter.types import SAMPLE_RATE, Samples
 
 BANDS, LOWEST_HZ = 20, 100.0
@@ -13,8 +14,6 @@ KNOWN_S, HEARD_S = 3.0, 4.0
 """Seconds of robot from which on its sound is known, and seconds of another sound that are compared with it."""
 MEMORY_S = 20.0
 """Seconds of robot over which its sound is averaged."""
-LOUD = 0.01
-"""Power over the robot's, -20 dB, from which on a hop counts: pauses say nothing."""
 NOISY = 4.0
 """Power over the noise's, 6 dB, from which on a band is compared."""
 ALIKE_DB = 4.5
@@ -50,7 +49,7 @@ class RobotSound:
         if self._hops < self._known:
             return None
         heard = np.add.reduceat(power, self._edges)
-        if heard.sum() < LOUD * self._robot.sum():
+        if heard.sum() < AUDIBLE * self._robot.sum():
             return None
         self._other += heard
         self._count += 1

@@ -24,7 +24,7 @@ COHERENCE = 0.3
 NOTICED = 1e-3
 """Error power over the microphone's, -30 dB, from which on a volume is suspected; 0.3 dB of volume leave that."""
 AUDIBLE, FORGET_S = 0.01, 10.0
-"""The robot is audible where the echo is within 20 dB of its recent peak, which fades by 10 dB in FORGET_S seconds."""
+"""The robot is audible where its power is within 20 dB of its recent peak, which fades by 10 dB in FORGET_S seconds."""
 MOST = 10.0
 """Largest factor, 20 dB, by which the volume is followed from where it was at first, up or down; and the factor by which
 a path that began unknown must have lowered the microphone's power before its volume means anything."""

@@ -18,8 +18,7 @@ from scipy import signal
 from bench.recordings import Clip, Signals
 from bench.simulate import conversations, simulated_robot
 from bench.simulate.simulated_robot import Robot
-
-RATE = 16000
+from edgefilter.types import SAMPLE_RATE as RATE
 
 
 def babble(seconds: float, seed: int) -> np.ndarray:

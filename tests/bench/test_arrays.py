@@ -13,9 +13,8 @@ from bench.recordings import NotHere
 from bench.simulate import arrays
 from bench.simulate.conversations import read_clips, read_voices, write_item
 from edgefilter.dsp.metrics import si_sdr
+from edgefilter.types import SAMPLE_RATE as RATE
 from tests.bench.conftest import driven
-
-RATE = 16000
 
 
 def noise_folder(folder: Path) -> Path:

@@ -17,8 +17,8 @@ import soundfile as sf
 
 from bench.simulate import corpora
 from bench.simulate.conversations import read_clips
+from edgefilter.types import SAMPLE_RATE as RATE
 
-RATE = 16000
 SELECTION = """set\tarchive\tspeaker\tchapter\tutterances
 train\ttrain-clean-100\t103\t1240\t0
 train\tspeechocean762\t0036\t\t34,36

@@ -16,9 +16,9 @@ from bench.simulate import hidden_cases, hidden_effects, hidden_robot
 from bench.simulate.conversations import Clip, write_item
 from bench.simulate.hidden_effects import CATALOGUE, CODECS, ENR_DB, OUTSIDE, RANGES, incoherent_db, through_codec
 from bench.simulate.hidden_robot import Chain, Scene
+from edgefilter.types import SAMPLE_RATE as RATE
 
 BENCH = Path(__file__).parents[2] / "bench" / "simulate"
-RATE = 16000
 NAMES = ("sweep_ref", "sweep_mic", "fan_only", "ref", "mic")
 
 

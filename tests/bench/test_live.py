@@ -12,7 +12,7 @@ import soundfile
 from bench import __main__ as bench
 from bench import closed_loop
 from bench.closed_loop import Output
-from bench.live import barge_in, click, soak
+from bench.live import barge_in, soak
 from bench.live.barge_in import early_errors, lasts, lowered, muted, silent_at, words
 from bench.metrics import first_sound
 from bench.recogniser import Recogniser
@@ -110,24 +110,6 @@ def test_a_leak_lost_samples_and_slowing_down_are_found() -> None:
     for one in live["slices"][15:]:
         one["learner_mb"] += 60.0
     assert soak.drifts(live) == ["the learner's memory grew by 60.0 MB"]
-
-
-# ---------------------------------------------------------------- clicks and devices
-
-
-def test_the_distance_between_two_clicks_is_exact() -> None:
-    rng = np.random.default_rng(0)
-    recording = rng.normal(0, 20, 48_000)
-    for at, gain in ((10_000, 1.0), (12_345, 0.5), (14_690, 0.25)):
-        recording[at : at + click.CLICK] += gain * click.click()
-    assert click.distance_ms(recording) == 1000 * 2345 / 16000
-    assert np.isnan(click.distance_ms(recording[:11_000]))
-
-
-@pytest.mark.slow
-def test_start_of_the_program_is_timed_to_its_first_samples() -> None:
-    seconds, memory_mb = click.start("ss")
-    assert 0.05 < seconds and 20 < memory_mb < 200
 
 
 # ---------------------------------------------------------------- barge-in in closed loop

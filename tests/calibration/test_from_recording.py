@@ -18,9 +18,9 @@ from edgefilter.echo.model import EchoModel
 from edgefilter.errors import SignalError, UsageError
 from edgefilter.filter.ego_filter import enhance
 from edgefilter.report.passport import SetUp
+from edgefilter.types import SAMPLE_RATE as RATE
 from tests.diagnosis.robot_scene import DELAY, FAN, path, record, voice
 
-RATE = 16000
 UNTOLD = {effect.name for effect in EFFECTS if effect.absorbed or effect.stage == "noise"}
 
 

@@ -2,8 +2,6 @@
 
 from edgefilter.cli import main
 
-RATE = 16000
-
 
 def arguments(scene, command, *more, mic="mic.wav", ref="ref.wav", profile="robot.npz"):
     words = ["--profile", scene / profile, "--recording", scene / mic, "--reference", scene / ref]

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 import soundfile
 
+from edgefilter.types import SAMPLE_RATE as RATE
 from tests.program import edgefilter, here, one_line
-
-RATE = 16000
 
 
 @pytest.fixture

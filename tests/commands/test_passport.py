@@ -12,9 +12,9 @@ from edgefilter.cli import main
 from edgefilter.diagnosis.passport import expected, measure
 from edgefilter.dsp.fractional_delay import interpolate
 from edgefilter.errors import SignalError
+from edgefilter.types import SAMPLE_RATE as RATE
 from tests.diagnosis.robot_scene import DELAY, record, voice
 
-RATE = 16000
 SECONDS = 12.0
 
 

@@ -12,9 +12,9 @@ import edgefilter
 from edgefilter.cli import main
 from edgefilter.commands.run import verdict_lines
 from edgefilter.session import Verdict
+from edgefilter.types import SAMPLE_RATE as RATE
 
 DEMO = Path(edgefilter.__file__).parent / "demo_data"
-RATE = 16_000
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import soundfile
 
+from edgefilter.types import SAMPLE_RATE as RATE
 from tests.program import argv
 
 ROOT = Path(__file__).parents[2]
@@ -18,7 +19,6 @@ DEMO = ROOT / "edgefilter/demo_data"
 CALIBRATION = ROOT / "tests/data/demo_calibration"
 REVERBERANT = ROOT / "tests/data/hidden/dev/11"
 """A simulated robot that was carried into a reverberant room after its calibration."""
-RATE = 16000
 ELSEWHERE = {"agent_pipecat.py", "agent_livekit.py", "agent_wyoming.py", "satellite.py"}
 """Whose conversation tests/integrations runs."""
 

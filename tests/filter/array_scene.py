@@ -8,8 +8,8 @@ import numpy as np
 
 from edgefilter import calibrate, generate_sweep
 from edgefilter.profile.data import Profile
+from edgefilter.types import SAMPLE_RATE as RATE
 
-RATE = 16000
 PATHS = [0.3 * np.eye(1, 900, 300 + at)[0] + 0.1 * np.eye(1, 900, 500 - 3 * at)[0] for at in range(4)]
 
 

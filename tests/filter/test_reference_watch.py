@@ -19,10 +19,10 @@ from edgefilter.filter.playback_faults import AHEAD, BEHIND, CHANCE, LENGTH, spe
 from edgefilter.filter.reference_watch import ReferenceWatch
 from edgefilter.filter.removal import Removal
 from edgefilter.profile.data import Profile
+from edgefilter.types import SAMPLE_RATE as RATE
 from edgefilter.types import SET_UP_WRONG, Frame
 
 DEMO = Path(edgefilter.__file__).parent / "demo_data"
-RATE = 16_000
 LAG = 2288
 """Samples after which the microphone of the bundled conversation hears the reference's first utterance."""
 

@@ -14,9 +14,9 @@ from edgefilter.dsp.resample import Resampler
 from edgefilter.integrations import duplex as module
 from edgefilter.integrations.duplex import Duplex, Pace, as_pcm16, from_pcm16
 from edgefilter.integrations.turns import TurnByTurn
+from edgefilter.types import SAMPLE_RATE as RATE
 from edgefilter.types import Event, Turn
 
-RATE = 16000
 DEMO = Path(edgefilter.__file__).parent / "demo_data"
 VOICE = 0.1 * np.random.default_rng(0).standard_normal(2 * RATE).astype(np.float32)
 

@@ -26,11 +26,11 @@ from edgefilter import EgoFilter
 from edgefilter.cli import main
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.filter.barge_in import BargeInSettings
+from edgefilter.types import SAMPLE_RATE as RATE
 from tests.program import argv
 
 ROOT = Path(__file__).parents[2]
 PROFILE = ROOT / "edgefilter/demo_data/profile.npz"
-RATE = 16_000
 FRAME = 320
 
 

@@ -33,11 +33,11 @@ from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.integrations.opus import Decoder, Encoder
 from edgefilter.integrations.serve import Service
 from edgefilter.integrations.wire import HEADER, Form, Limits, TwoStreams
+from edgefilter.types import SAMPLE_RATE as RATE
 from tests.program import argv
 
 ROOT = Path(__file__).parents[2]
 DEMO = Path(edgefilter.__file__).parent / "demo_data"
-RATE = 16_000
 MICROPHONE, REFERENCE = 0, 1
 BOTH = slice(9 * RATE, 15 * RATE)
 """Where human and robot talk at once in the bundled conversation."""

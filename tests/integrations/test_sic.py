@@ -17,11 +17,11 @@ from edgefilter.calibration.calibrate import cross_density
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.dsp.resample import Resampler
 from edgefilter.profile.array import ArrayCalibration
+from edgefilter.types import SAMPLE_RATE as RATE
 
 ROOT = Path(__file__).parents[2]
 PROGRAM = Path(__file__).with_name("sic_program.py")
 PROFILE = ROOT / "edgefilter/demo_data/profile.npz"
-RATE = 16_000
 
 
 class Cloud:

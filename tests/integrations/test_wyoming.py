@@ -27,8 +27,8 @@ from edgefilter import EgoFilter
 from edgefilter.integrations import wyoming as module
 from edgefilter.integrations.duplex import as_pcm16, from_pcm16
 from edgefilter.integrations.wyoming import EgoService, Player, main
+from edgefilter.types import SAMPLE_RATE as RATE
 
-RATE = 16_000
 NOISE = 0.1 * np.random.default_rng(0).standard_normal(RATE).astype(np.float32)
 NOBODY = "tcp://127.0.0.1:9"
 """Where no service is: the port of the discard protocol, which nobody runs."""

@@ -21,9 +21,8 @@ from edgefilter.report import text
 from edgefilter.report.html import choices, compare_variants, diagnosis_page
 from edgefilter.report.media import LEVELS, MAX_COLUMNS, colour_scale, colours, sound, spectrogram_db, spectrogram_png
 from edgefilter.report.text import LINES, add_command, coarser, diagnosis_lines, summary_lines
+from edgefilter.types import SAMPLE_RATE as RATE
 from tests.diagnosis.robot_scene import profile, record, voice
-
-RATE = 16000
 
 
 def content(address: str) -> io.BytesIO:
