@@ -13,7 +13,8 @@ import soundfile
 from edgefilter.cli import main
 from edgefilter.profile.data import PROVISIONAL, Profile
 from edgefilter.report.text import decibels
-from tests.commands.diagnosis_scene import RATE, arguments, fails_in_one_line
+from edgefilter.types import SAMPLE_RATE as RATE
+from tests.commands.diagnosis_scene import arguments, fails_in_one_line
 from tests.diagnosis.robot_scene import RESONANCE, office, profile, record, voice
 
 PROOF = {"effects", "start_s", "seconds", "erle_before_db", "erle_after_db", "without", "worse"}

@@ -10,7 +10,8 @@ import soundfile
 
 from edgefilter.cli import main
 from edgefilter.profile.data import Profile
-from tests.commands.diagnosis_scene import RATE, arguments, fails_in_one_line
+from edgefilter.types import SAMPLE_RATE as RATE
+from tests.commands.diagnosis_scene import arguments, fails_in_one_line
 from tests.diagnosis.robot_scene import profile, record, voice
 from tests.echo.own_effect import documented_file
 
