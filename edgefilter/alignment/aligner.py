@@ -14,7 +14,7 @@ from edgefilter.alignment.belief import LOOK, Belief, believed
 from edgefilter.alignment.coarse_lag import CoarseLag
 from edgefilter.alignment.delay_line import HALF_WIDTH, WAIT, DelayBuffer, kernel_table, read_delayed, read_line
 from edgefilter.alignment.delay_tracker import DRIFTED, FAINT, SIZE, STRIDE, DelayMeasurement, DelayMeter, DriftFilter
-from edgefilter.alignment.lag_search import ALIKE, CERTAIN, EVEN, MINIMUM, MOST_LAG_S, SAME, Found, LagSearch
+from edgefilter.alignment.lag_search import ALIKE, CERTAIN, EVEN, MINIMUM, MOST_LAG_S, SAME, WINDOW, Found, LagSearch
 from edgefilter.alignment.utterances import AHEAD, Announcements, FirstSounds, OnsetDetector, Playback, Utterance
 from edgefilter.profile.data import Profile
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, AlignmentCounts, AlignmentState, AlignmentStats, Samples
@@ -115,7 +115,10 @@ class Aligner:
         """What an arrival looks like from now on: the microphones' impulse responses (taps,); None: anything."""
         self._responses = responses
         self._lags = LagSearch(self._max_lag, responses or (), LATE, (FURTHEST, LATEST, LATEST + LOOK))
-        self._meter = DelayMeter(None if responses is None else responses[self._used[0]])
+        self._meter = self._new_meter()
+
+    def _new_meter(self) -> DelayMeter:
+        return DelayMeter(None if self._responses is None else self._responses[self._used[0]])
 
     def reset(self) -> None:
         """Forget everything, as after construction."""
@@ -152,7 +155,7 @@ class Aligner:
         self._mics += [DelayBuffer(self._ref.capacity) for _ in range(len(self._mics), max(used) + 1)]
         first, self._used = self._used[0], list(used)
         if self._responses is not None and self._used[0] != first:
-            self._meter = DelayMeter(self._responses[self._used[0]])
+            self._meter = self._new_meter()
 
     def announce(self, utterance: Samples) -> bool:
         """Say what will be played (n,); it may begin at any time or never, and several are played in the order of announcing.
@@ -379,9 +382,15 @@ class Aligner:
             return self._begin(self._expected.start + found.lag)
         was_refuted = self._refuted
         self._resolve()
-        if self._known and abs(found.lag - self._drift.delay) < 24:
-            return was_refuted
-        return self._switch(float(found.lag))
+        if not self._known or abs(found.lag - self._drift.delay) > SAME:
+            return self._switch(float(found.lag))
+        if (
+            self._gain is None
+        ):  # found again, though no measurement has seen it: a broad arrival has no peak before its shape is known
+            self._meter = self._new_meter()
+            drift, now = self._drift, self._ref.end
+            self._meter.study(self._mics[self._used[0]], self._ref, now - WINDOW, now, drift.delay, drift.slope)
+        return was_refuted
 
     def _begin(self, heard_at: int) -> bool:
         """What was announced is heard since heard_at: from now on it is the reference."""

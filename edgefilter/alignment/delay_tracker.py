@@ -186,6 +186,13 @@ class DelayMeter:
         """The last measurement was believed, with this offset: `learn`, when there is time, takes it into the response."""
         self._confirmed = offset
 
+    def study(self, mic: DelayBuffer, ref: DelayBuffer, start: int, now: int, delay: float, slope: float) -> None:
+        """Learn the response from the sound from start to now, in which this delay was found; the next measurement uses other sound."""
+        for end in range(start + FRAME, now - FRAME + 1, STRIDE):
+            if self.measure(mic, ref, end, delay, slope, far=False):
+                self.confirm(0.0)
+                self.learn()
+
     def learn(self) -> None:
         """Take what was confirmed last, if it has not been taken yet, into the response: its cross-spectrum, shifted by its offset."""
         if self._confirmed is None:

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from edgefilter.alignment import aligner as aligner_module
 from edgefilter.alignment.aligner import Aligner
 from edgefilter.alignment.delay_line import DelayBuffer, read_delayed, read_line
-from edgefilter.alignment.delay_tracker import DelayMeasurement, JumpWitness
+from edgefilter.alignment.delay_tracker import DelayMeasurement, DelayMeter, JumpWitness
 from edgefilter.alignment.lag_search import Found, LagSearch
 from edgefilter.alignment.paper import PaperAligner
 from edgefilter.types import PRE_ROLL
@@ -429,6 +430,29 @@ def test_a_delay_that_no_look_has_seen_is_searched_again():
     found = next(at for at, hop in enumerate(hops) if abs(hop.delay - 700 - HEAD) < CLOSE)
     assert lost < found < 2 * RATE // 256
     assert hops[lost].confidence < 0.5 < hops[found].confidence
+
+
+def test_where_no_measurement_sees_the_robot_its_arrival_is_studied_once_it_is_found_again(monkeypatch):
+    """And not at first, since most arrivals are sharp, and what a measurement learns by itself is more exact."""
+    rng = np.random.default_rng(21)
+    ref, onsets = utterances(rng, [5.0], [0.5])
+    mic, _ = hear(ref, [(0, 700)], room(rng, 0.3))
+    studied = []
+
+    class Blind(DelayMeter):
+        def measure(self, *args, **kwargs):
+            found = super().measure(*args, **kwargs)
+            return found and replace(found, strength=1.0 if not studied else found.strength)
+
+        def study(self, mic, ref, start, now, delay, slope):
+            studied.append((now - onsets[0] - delay) / RATE)
+            super().study(mic, ref, start, now, delay, slope)
+
+    monkeypatch.setattr(aligner_module, "DelayMeter", Blind)
+    hops = run(Aligner(256), mic, ref)
+    assert len(studied) == 1 and 0.3 < studied[0] < 1.5
+    assert [hop.state for hop in hops].count("locked") > 3 * RATE / 256
+    assert abs(hops[-1].delay - 700 - HEAD) < 1
 
 
 def test_one_look_is_not_enough_for_a_far_jump_however_clear_it_is():

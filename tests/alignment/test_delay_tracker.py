@@ -197,3 +197,22 @@ def test_a_look_finds_how_far_the_delay_is_off_and_whether_another_place_is_the_
     found = DelayMeter().measure(mic, ref, 30_000, 500.0, 0.0, far)
     assert found is not None and found.offset == pytest.approx(error, abs=0.05)
     assert found.dominance == pytest.approx(1.0) if error == 0.0 else found.dominance > 2.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_an_arrival_that_is_spread_out_is_seen_at_its_delay_once_the_sound_that_showed_it_is_studied(seed):
+    rng = np.random.default_rng(seed)
+    spread = np.hanning(240) * rng.standard_normal(240)
+    voice = rng.standard_normal(40 * STRIDE).astype(np.float32)
+    heard = np.convolve(voice, np.concatenate((np.zeros(900), spread)))[: voice.size].astype(np.float32)
+    mic, ref = DelayBuffer(voice.size), DelayBuffer(voice.size)
+    mic.push(heard)
+    ref.push(voice)
+    meter, now = DelayMeter(), 20 * STRIDE
+    before = meter.measure(mic, ref, now + FRAME, 1000.0, 0.0, far=False)
+    meter = DelayMeter()
+    meter.study(mic, ref, now - 7 * STRIDE, now, 1000.0, 0.0)
+    after = meter.measure(mic, ref, now + FRAME, 1000.0, 0.0, far=False)
+    assert abs(before.offset) > 8.0 or before.strength < 10.0
+    assert abs(after.offset) < 1.0
+    assert after.strength > 1.5 * before.strength
