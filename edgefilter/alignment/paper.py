@@ -86,31 +86,21 @@ class PaperAligner:
 
     def _begin(self, onset: int | None) -> None:
         self._onset = onset
-        self._template: np.ndarray | None = None
         self._scanned, self._best, self._best_lag = 0, 0.0, 0
 
     def _search(self) -> None:
-        onset = self._onset
-        if onset is None:
-            if not self._waiting:
-                return
-            onset = self._waiting.popleft()
-            self._begin(onset)
-        now = self._ref.end
-        if self._template is None and now >= onset + TEMPLATE:
-            template = self._ref.read(onset, onset + TEMPLATE)
-            self._energy = float(np.dot(template, template))
-            self._template = np.conj(fft.rfft(template, self._size))
-        if self._template is not None and now >= onset + self._scanned + STRIDE + TEMPLATE:
-            self._scan(onset + self._scanned, self._template)
+        if self._onset is None and self._waiting:
+            self._begin(self._waiting.popleft())
+        if self._onset is not None and self._ref.end >= self._onset + self._scanned + STRIDE + TEMPLATE:
+            self._scan(self._ref.read(self._onset, self._onset + TEMPLATE), self._onset + self._scanned)
 
-    def _scan(self, at: int, template: np.ndarray) -> None:
+    def _scan(self, template: Samples, at: int) -> None:
         """Evaluate the next STRIDE lags, whose half second of microphone, from at on, is now complete (overlap-save)."""
         mic = self._mic.read(at, at + STRIDE + TEMPLATE - 1)
-        correlation = fft.irfft(fft.rfft(mic, self._size) * template, self._size)[:STRIDE]
+        cross = fft.rfft(mic, self._size) * np.conj(fft.rfft(template, self._size))
         total = np.concatenate(([0.0], np.cumsum(np.square(mic, dtype=np.float64))))
-        energy = total[TEMPLATE:] - total[:-TEMPLATE]
-        score = correlation / np.sqrt((energy + 1e-9) * (self._energy + 1e-9))
+        energy = (total[TEMPLATE:] - total[:-TEMPLATE] + 1e-9) * (float(np.dot(template, template)) + 1e-9)
+        score = fft.irfft(cross, self._size)[:STRIDE] / np.sqrt(energy)
         lag = int(np.argmax(score))
         if score[lag] > self._best:
             self._best, self._best_lag = float(score[lag]), self._scanned + lag
