@@ -6,11 +6,18 @@ import sys
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
+import soundfile
+
 from edgefilter.cli import main
 
 ROOT = Path(__file__).parents[1]
 DEMO = ROOT / "edgefilter/demo_data"
 CALIBRATION = ROOT / "tests/data/demo_calibration"
+
+
+def demo(*names):
+    """Bundled sounds, each (n,) float32."""
+    return [soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in names]
 
 
 def here(*words):

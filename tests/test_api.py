@@ -14,8 +14,7 @@ import edgefilter
 from edgefilter import EgoFilter, calibrate, enhance, generate_sweep, types
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.errors import UsageError
-
-DEMO = Path(edgefilter.__file__).parent / "demo_data"
+from tests.program import DEMO, demo
 
 
 def test_each_public_name_is_defined_where_the_stub_says():
@@ -55,7 +54,7 @@ def test_stats_have_the_keys_of_their_type(engine):
 
 @pytest.mark.slow
 def test_events_are_of_the_kinds_of_their_type():
-    mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
+    mic, ref = demo("mic", "reference")
     ego = EgoFilter(DEMO / "profile.npz", engine="crnn")
     ego.process(mic, ref)
     kinds = {event.kind for event in ego.events()}

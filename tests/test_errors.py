@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import edgefilter
 from edgefilter import errors
 from edgefilter.cli import main
+from tests.program import DEMO
 
-DEMO = Path(edgefilter.__file__).parent / "demo_data"
 HOSTILE = "reverb\x1b]0;owned\x07\x1b[2J\nedgefilter: all is well\u202e\x9b"
 """A name that sets a terminal's title, clears it, writes a line of its own, and turns the writing around."""
 

@@ -2,9 +2,9 @@
 
 import re
 import subprocess
-from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
+from tests.program import ROOT
+
 MOST_MB = 4.5
 """The largest file, models/crnn.onnx, has 4.2 MB."""
 

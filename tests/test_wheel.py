@@ -14,7 +14,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+from tests.program import ROOT
+
 BELONGINGS = ("edgefilter", "models", "pyproject.toml", "README.md", "LICENSE", "NOTICE")
 NOT_CODE = {
     "edgefilter/py.typed",

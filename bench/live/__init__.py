@@ -1,6 +1,6 @@
 r"""Robots that talk and are interrupted: on virtual devices in real time, and over minutes and hours of recordings.
 
-    python -m bench live soak --minutes 60                    faster than real time; --one-way: the clocks go on drifting
+    python -m bench live soak --minutes 60                    faster than real time
     python -m bench live hour --minutes 60                    the same on virtual devices
     python -m bench live barge-in --voices ROBOT/test --speech HUMAN/test --count 24 --seed 17 \
         --whisper WHISPER --alone ROBOT/test SYNTHESIZERS --minutes 60 --real RECORDINGS
@@ -28,7 +28,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--minutes", type=float, default=10.0, help="of the run, or of robot speech (default: %(default)s)")
     add("--count", type=int, default=16, help="conversations (default: %(default)s)")
     add("--engine", help="default: auto; of barge-in crnn")
-    add("--one-way", action="store_true", help="soak: the reference's clock is fast all the time")
     uninterrupted = "barge-in: voices of robots that nobody interrupts"
     add("--alone", type=Path, nargs="*", default=[], metavar="DIR", help=uninterrupted)
     add(

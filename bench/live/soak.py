@@ -2,8 +2,7 @@
 
 soak: so many minutes of audio faster than real time; hour: the same live on virtual devices, with the learner. The sound
 is the bundled conversation over and over. In a soak the reference has a clock that is PPM fast for TURN_S and as much
-slow for the next, so that the alignment has work to do for ever; --one-way: fast all the time, so that after some seven
-hours the lag is beyond all that are looked for. Memory and processor time per block are read once in each of SLICES, the
+slow for the next, so that the alignment has work to do for ever. Memory and processor time per block are read once in each of SLICES, the
 learner's memory each second, of which the slice has the most. The first tenth of the run, a minute at least, is warm-up:
 a shorter run tells only which samples were lost. Exit code 1 where something drifted.
 """
@@ -56,13 +55,12 @@ def run(options: argparse.Namespace) -> str:
     engine = options.engine or "auto"
     # "auto" is crnn wherever that is fast enough
     made_with = provenance.stamp({"DEMO": [DEMO]}, [options.engine or "crnn"])
-    is_live, one_way = options.part == "hour", options.one_way
-    found = live(options.minutes, engine) if is_live else from_file(options.minutes, engine, one_way)
+    part, is_live = options.part, options.part == "hour"
+    found = live(options.minutes, engine) if is_live else from_file(options.minutes, engine)
     found["load_average"] = os.getloadavg()[0]
     troubles, slices = drifts(found), found["slices"]
     minutes = found["samples_in"] / SAMPLE_RATE / 60
-    how = ("live" if is_live else "faster than real time") + (", a lag that grows all the time" if one_way else "")
-    title = f"{minutes:.0f} minutes of `{found['engine']}`, {how}"
+    title = f"{minutes:.0f} minutes of `{found['engine']}`, {'live' if is_live else 'faster than real time'}"
     facts = [(key.replace("_", " "), value) for key, value in found.items() if isinstance(value, int | float | str)]
     if deadline := found.get("deadline"):
         facts += late(deadline).items()
@@ -72,10 +70,9 @@ def run(options: argparse.Namespace) -> str:
     at, *values = zip(*rows)
     lines = {key: (at, of) for key, of in zip(keys, values)}
     curves = [results.panel(key.replace("_", " "), "minutes", "", {key: line}, "o-") for key, line in lines.items()]
-    part, verdict = options.part, f"Verdict: {'; '.join(troubles) or 'nothing drifted'}"
+    verdict = f"Verdict: {'; '.join(troubles) or 'nothing drifted'}"
     tables = [results.table(part, verdict, ["", ""], facts), results.table(f"{part}-slices", "By time", columns, rows)]
-    name = part + ("_one_way" if one_way else "")
-    page = results.write(options.output, name, title, made_with, tables, [results.plot(part, curves)], **found)
+    page = results.write(options.output, part, title, made_with, tables, [results.plot(part, curves)], **found)
     if troubles:
         raise UsageError("; ".join(troubles))
     return page
@@ -91,29 +88,29 @@ def late(deadline: Mapping) -> dict[str, object]:
     }
 
 
-def ahead(at: np.ndarray, one_way: bool) -> np.ndarray:
+def ahead(at: np.ndarray) -> np.ndarray:
     """Samples that the reference's clock has gained at these samples."""
     turn = round(TURN_S * SAMPLE_RATE)
-    return PPM * 1e-6 * (at if one_way else turn - np.abs(at % (2 * turn) - turn))
+    return PPM * 1e-6 * (turn - np.abs(at % (2 * turn) - turn))
 
 
-def blocks(total: int, one_way: bool = False) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def blocks(total: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """So many samples of the conversation in a loop, the reference on its own clock."""
     mic, ref = (read(DEMO / f"{name}.flac") for name in ("mic", "reference"))
     for start in range(0, total, BLOCK):
         at = np.arange(start, min(start + BLOCK, total))
-        place = at + ahead(at, one_way)
+        place = at + ahead(at)
         whole = place.astype(np.int64)
         part = (place - whole).astype(np.float32)
         yield mic[at % mic.size], (1 - part) * ref[whole % ref.size] + part * ref[(whole + 1) % ref.size]
 
 
-def from_file(minutes: float, engine: str, one_way: bool = False) -> dict:
+def from_file(minutes: float, engine: str) -> dict:
     """So many minutes of audio through the whole path as fast as it goes."""
     ego, yardstick = EgoFilter(DEMO / "profile.npz", engine=engine), EgoFilter(engine="bypass")
     total, done, out, not_finite = round(60 * minutes * SAMPLE_RATE), 0, 0, 0
     took, bypassed, slices = [], [], []
-    for number, (mic, ref) in enumerate(blocks(total, one_way)):
+    for number, (mic, ref) in enumerate(blocks(total)):
         start = time.thread_time()
         finished = ego.process(mic, ref)
         took.append(1000 * (time.thread_time() - start))

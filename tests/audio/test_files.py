@@ -6,7 +6,6 @@ import resource
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,8 +19,7 @@ from edgefilter.errors import AudioFileError, EdgefilterError, UsageError
 from edgefilter.report.html import write_page
 from edgefilter.report.plots import plot_before_after
 from edgefilter.types import Block
-
-ROOT = Path(__file__).parents[2]
+from tests.program import ROOT
 
 
 def noise(count, seed=0):

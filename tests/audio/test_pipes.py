@@ -3,15 +3,13 @@
 import os
 import subprocess
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
 import soundfile
 
-from tests.program import argv
+from tests.program import ROOT, argv
 
-ROOT = Path(__file__).parents[2]
 STEREO = np.random.default_rng(0).integers(-9000, 9000, (4000, 2)).astype("<i2")
 
 

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from tests.program import ROOT
+
 FILES = sorted((ROOT / "bench").rglob("*.py"))
 EXAMPLES = [path for path in FILES if ">>>" in path.read_text(encoding="utf-8")]
 

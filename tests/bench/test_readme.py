@@ -12,8 +12,8 @@ import pytest
 
 from bench import __main__ as program
 from bench import results
+from tests.program import ROOT
 
-ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "bench" / "README.md").read_text(encoding="utf-8")
 MODULES = re.findall(r"python -m (bench\.[\w.]+)([^`\n]*)", PAGE)
 SCENARIOS = re.findall(r"python -m bench (\w+)([^`\n]*)", PAGE)

@@ -18,13 +18,11 @@ from edgefilter.filter.barge_in import OwnVoice
 from edgefilter.filter.residual_echo import Residual
 from edgefilter.profile.data import GRID_HZ
 from edgefilter.profile.while_moving import WhileMoving
-from tests.program import CALIBRATION, DEMO
+from tests.program import CALIBRATION, DEMO, demo
 
 STFT = StftConfig()
 RATE, MOTORS_HZ, MOTORS_DB = 16_000, 2000.0, -12.0
-SAID, HEARD, HUMAN = (
-    soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("reference", "mic", "human")
-)
+SAID, HEARD, HUMAN = demo("reference", "mic", "human")
 ALONE = HEARD - HUMAN
 KNOWN = Profile.load(DEMO / "profile.npz")
 

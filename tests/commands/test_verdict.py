@@ -2,19 +2,16 @@
 
 import json
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 import soundfile
 
-import edgefilter
 from edgefilter.cli import main
 from edgefilter.commands.run import verdict_lines
 from edgefilter.session import Verdict
 from edgefilter.types import SAMPLE_RATE as RATE
-
-DEMO = Path(edgefilter.__file__).parent / "demo_data"
+from tests.program import DEMO
 
 
 @pytest.fixture

@@ -11,11 +11,9 @@ import pytest
 import soundfile
 
 from edgefilter.types import SAMPLE_RATE as RATE
-from tests.program import argv
+from tests.program import DEMO, ROOT, argv
 
-ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "docs/examples"
-DEMO = ROOT / "edgefilter/demo_data"
 CALIBRATION = ROOT / "tests/data/demo_calibration"
 REVERBERANT = ROOT / "tests/data/hidden/dev/11"
 """A simulated robot that was carried into a reverberant room after its calibration."""

@@ -2,11 +2,11 @@
 
 import ast
 import re
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from tests.program import ROOT
+
 ROWS = [
     line
     for line in (ROOT / "docs" / "faults.md").read_text(encoding="utf-8").splitlines()

@@ -2,15 +2,14 @@
 
 import argparse
 import re
-from pathlib import Path
 
 import pytest
 
 import edgefilter
 from edgefilter.cli import build_parser
 from edgefilter.engines import ENGINES
+from tests.program import ROOT
 
-ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 CLI, API, ARCHITECTURE = ((DOCS / f"{name}.md").read_text() for name in ("cli", "api", "architecture"))
 

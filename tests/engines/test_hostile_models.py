@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from pathlib import Path
 
 import hypothesis.strategies as st
 import numpy as np
@@ -18,8 +17,8 @@ from edgefilter.engines import onnx_graph, onnx_session
 from edgefilter.engines.crnn import LOUDEST, SURE, Crnn
 from edgefilter.errors import ModelError
 from edgefilter.types import Frame
+from tests.program import ROOT
 
-ROOT = Path(__file__).parents[2]
 EDGE = ROOT / "tests" / "data" / "crnn.onnx"
 
 

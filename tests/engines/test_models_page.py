@@ -10,7 +10,8 @@ from pathlib import Path
 import onnxruntime
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from tests.program import ROOT
+
 SHIPPED = sorted((*(ROOT / "models").glob("*.onnx"), *(ROOT / "bench/models").glob("*.onnx")))
 FOR_TESTS = sorted((ROOT / "tests" / "data").glob("*.onnx"))
 

@@ -22,11 +22,9 @@ from edgefilter.filter.stream import Stream
 from edgefilter.profile.data import LEARNED, Profile
 from edgefilter.types import Frame
 from tests import conformance
-from tests.program import argv
+from tests.program import DEMO, ROOT, argv, demo
 
 DATA = Path(__file__).parents[1] / "data"
-ROOT = Path(__file__).parents[2]
-DEMO = ROOT / "edgefilter/demo_data"
 EDGE, PAPER = DATA / "crnn.onnx", DATA / "paper_crnn.onnx"
 
 
@@ -235,9 +233,7 @@ def test_the_packages_int8_file_is_of_the_same_training_as_the_exact_one():
 @pytest.mark.slow
 def test_the_exact_network_filters_the_demo_as_the_int8_one_does():
     """Both files are run: each brings the human out, and what int8 weights change is far under the answer."""
-    mic, ref, human = (
-        soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference", "human")
-    )
+    mic, ref, human = demo("mic", "reference", "human")
     models = (ROOT / "models/crnn.onnx", ROOT / "models/crnn_int8.onnx")
     exact, small = (enhance(mic, ref, DEMO / "profile.npz", engine="crnn", model=model) for model in models)
     speaking = np.flatnonzero(human)

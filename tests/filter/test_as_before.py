@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-import soundfile
 
 from edgefilter import EgoFilter, Profile
 from edgefilter.filter.budget import DEMO
 from tests.as_before import levels_db, same_as_before
 from tests.filter.array_scene import calibration, talk
 from tests.learning.scenes import Scene
+from tests.program import demo
 
 UNTIMED = ("engine", "engine_reason", "engines", "alignment", "linear_stage", "array", "samples")
 
@@ -35,7 +35,7 @@ def told(ego: EgoFilter, mic: np.ndarray, ref: np.ndarray) -> dict:
     ("engine", "knows"), [("linear", True), ("ss", True), ("crnn", True), ("linear", False), ("crnn", False)]
 )
 def test_of_the_demonstration(engine: str, knows: bool) -> None:
-    mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
+    mic, ref = demo("mic", "reference")
     profile = Profile.load(DEMO / "profile.npz") if knows else None
     found = told(EgoFilter(profile, engine=engine), mic, ref)
     same_as_before(f"filter_demo_{engine}_{'known' if knows else 'unknown'}", found, 0.1, 1e-3)

@@ -14,6 +14,7 @@ from edgefilter.filter.barge_in import ERROR, FALL, BargeIn, BargeInSettings, hu
 from edgefilter.filter.budget import DEMO
 from edgefilter.filter.stream import Stream
 from edgefilter.types import SAMPLE_RATE, Event, Output
+from tests.program import demo
 
 HOP_S = 0.016
 UNSURE = 0.3
@@ -170,7 +171,7 @@ def test_who_interrupts_again_and_again_is_noticed_each_time_as_soon():
 @pytest.mark.slow
 @pytest.mark.parametrize("calibrated", [True, False])
 def test_the_first_sounds_of_a_robot_whose_lag_is_not_found_yet_are_nobody(calibrated):
-    mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
+    mic, ref = demo("mic", "reference")
     ego, highest, heard = EgoFilter(DEMO / "profile.npz" if calibrated else None, engine="crnn"), 0.0, 0.0
     for at in range(0, ref.size, ego.hop):
         ego.process(mic[at : at + ego.hop], ref[at : at + ego.hop])
@@ -188,7 +189,7 @@ def test_probabilities_stay_in_0_to_1_whatever_comes(probability):
 
 
 def test_an_engine_without_a_network_gives_no_probability_and_no_events():
-    mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
+    mic, ref = demo("mic", "reference")
     ego = EgoFilter(DEMO / "profile.npz", engine="ss")
     ego.process(mic, ref)
     assert ego.speech_probability is None and not ego.human_speaks
@@ -359,7 +360,7 @@ def test_a_live_run_says_when_somebody_speaks_and_a_recording_does_not(capsys):
 
 def test_a_human_beside_a_robot_that_plays_unheard_is_noticed_at_once():
     """Into headphones, say: the microphone is silent, digitally, until somebody speaks."""
-    robot, human = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("reference", "human"))
+    robot, human = demo("reference", "human")
     robot = np.tile(robot[: 3 * SAMPLE_RATE], 2)
     first = int(np.argmax(np.abs(human) > 0.01))
     mic, begins = np.zeros_like(robot), 3 * SAMPLE_RATE

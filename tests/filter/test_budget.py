@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import platformdirs
 import pytest
-import soundfile
 from platformdirs.macos import MacOS
 from platformdirs.unix import Unix
 from platformdirs.windows import Windows
@@ -26,7 +25,7 @@ from edgefilter.filter import budget
 from edgefilter.filter.budget import Figures, choose, fits, held_to, measure, pace, scene, timings
 from edgefilter.filter.stream import Stream
 from edgefilter.profile.data import Profile
-from tests.program import argv
+from tests.program import argv, demo
 
 DEMO = budget.DEMO
 SMALL = Path(__file__).parents[1] / "data/crnn.onnx"
@@ -267,7 +266,7 @@ def test_the_choice_says_on_how_many_cores_it_was_measured(measured, monkeypatch
 
 @pytest.mark.parametrize("hop", [160, 256])
 def test_the_conversation_comes_from_its_first_sample_on_whole_hops_of_it_over_and_over(hop):
-    mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
+    mic, ref = demo("mic", "reference")
     count, hops = mic.size // hop, scene(hop)
     for _ in range(2):
         for channel, heard in zip((mic, ref), zip(*islice(hops, count), strict=True), strict=True):

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import soundfile
 from scipy import signal
 
 from edgefilter import enhance
@@ -17,6 +16,7 @@ from edgefilter.filter.front_end import RUMBLE, FrontEnd
 from edgefilter.filter.residual_echo import Residual
 from edgefilter.types import SAMPLE_RATE
 from tests.conformance import robot
+from tests.program import demo
 
 
 def test_without_a_profile_rumble_is_lowered_and_with_one_it_is_as_it_was():
@@ -179,7 +179,7 @@ def test_rumble_does_not_spoil_what_is_learned_at_the_robot_s_frequencies():
 
 def demonstration() -> tuple[np.ndarray, np.ndarray]:
     """Microphone and reference of the bundled robot, alone from 1 s to 6 s."""
-    mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
+    mic, ref = demo("mic", "reference")
     return mic[: 8 * SAMPLE_RATE], ref[: 8 * SAMPLE_RATE]
 
 

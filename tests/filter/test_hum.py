@@ -9,6 +9,7 @@ from edgefilter.dsp.metrics import si_sdr
 from edgefilter.filter.budget import DEMO
 from edgefilter.filter.hum import Hum
 from edgefilter.types import SAMPLE_RATE
+from tests.program import demo
 
 SECONDS = np.arange(16 * SAMPLE_RATE) / SAMPLE_RATE
 
@@ -54,9 +55,7 @@ def test_what_is_no_hum_stays_bit_for_bit(name):
 
 def test_a_human_who_interrupts_a_robot_is_nearly_as_clear_beside_hum_as_without():
     """21 dB of SI-SDR were lost: the hum itself, and what it leaked into other bins hid the robot from the canceller."""
-    mic, ref, human = (
-        soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference", "human")
-    )
+    mic, ref, human = demo("mic", "reference", "human")
     part = np.flatnonzero(human)[[0, -1]]
     found = [
         si_sdr(enhance(x, ref, None, engine="linear")[slice(*part)], human[slice(*part)])

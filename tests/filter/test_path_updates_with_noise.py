@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-import edgefilter
 from edgefilter import Profile
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.engines.spectral_subtraction import SpectralSubtraction
 from edgefilter.filter.echo_path import FilteredHop, PathState, PathUpdate
 from edgefilter.filter.stream import Stream
+from tests.program import DEMO
 
-DEMO = Path(edgefilter.__file__).parent / "demo_data"
 MIDDLE = {one.name: (one.neutral + one.high) / 2 for one in find("rattle").told}
 WITH = (("rattle", {**MIDDLE, "threshold": 0.1, "outward": 0.0, "inward": 0.0}),)
 

@@ -13,15 +13,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-import edgefilter
 from edgefilter import EgoFilter, Profile
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.errors import SignalError
 from edgefilter.filter.residual_echo import Residual
 from edgefilter.types import SAMPLE_RATE
 from tests.filter.loudness import loudest_over_mic_db
+from tests.program import DEMO
 
-DEMO = Path(edgefilter.__file__).parent / "demo_data"
 TINY = Path(__file__).parents[1] / "data" / "crnn.onnx"
 FILTERS = {
     "bypass": partial(EgoFilter, engine="bypass"),

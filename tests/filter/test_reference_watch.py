@@ -1,14 +1,12 @@
 """A reference that is late, missing, or another sound: it is said, and no robot is taken for somebody because of it."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 import soundfile
 from scipy import signal
 
-import edgefilter
 from edgefilter import EgoFilter
 from edgefilter.alignment.aligner import Aligned, Past
 from edgefilter.alignment.belief import Belief
@@ -21,8 +19,8 @@ from edgefilter.filter.removal import Removal
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE as RATE
 from edgefilter.types import SET_UP_WRONG, Frame
+from tests.program import DEMO, demo
 
-DEMO = Path(edgefilter.__file__).parent / "demo_data"
 LAG = 2288
 """Samples after which the microphone of the bundled conversation hears the reference's first utterance."""
 
@@ -57,7 +55,7 @@ def test_a_robot_whose_reference_is_late_is_not_taken_for_somebody_and_the_laten
 
 @pytest.mark.slow
 def test_a_reference_in_time_is_said_nothing_of_and_the_human_is_noticed_as_before():
-    mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
+    mic, ref = demo("mic", "reference")
     found = events(EgoFilter(DEMO / "profile.npz", engine="crnn"), mic, ref)
     assert not {event.kind for event in found} & set(SET_UP_WRONG)
     (began,) = (event for event in found if event.kind == "speech_started")

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import soundfile
 
-import edgefilter
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.filter.ego_filter import EgoFilter, enhance
 from edgefilter.filter.volume import Volume
 from edgefilter.profile.data import Profile
 from tests.conformance import robot_speech
+from tests.program import DEMO
 
-DEMO = Path(edgefilter.__file__).parent / "demo_data"
 SAME_DB = 0.5
 """What is asked for at -40 to +40 dB; 0.2 dB were seen."""
 

@@ -1,14 +1,11 @@
 """What an agent's clock does to its speech, and what of it becomes the filter's reference."""
 
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
-import soundfile
 import soxr
 
-import edgefilter
 from edgefilter import EgoFilter, SignalError, UsageError
 from edgefilter.dsp.resample import Resampler
 from edgefilter.integrations import duplex as module
@@ -16,8 +13,8 @@ from edgefilter.integrations.duplex import Duplex, Pace, as_pcm16, from_pcm16
 from edgefilter.integrations.turns import TurnByTurn
 from edgefilter.types import SAMPLE_RATE as RATE
 from edgefilter.types import Event, Turn
+from tests.program import demo
 
-DEMO = Path(edgefilter.__file__).parent / "demo_data"
 VOICE = 0.1 * np.random.default_rng(0).standard_normal(2 * RATE).astype(np.float32)
 
 
@@ -312,7 +309,7 @@ def test_a_loss_shows_at_once_in_frames_that_carry_their_time(witness):
 @pytest.mark.slow
 def test_a_robot_is_removed_though_the_microphone_lost_a_fifth_of_a_second_of_it(room_of):
     """What was lost of its reference is still to be heard then, for as long as the lag: it passed, and was taken for a human."""
-    mic, ref = (soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference"))
+    mic, ref = demo("mic", "reference")
     clock = Clock()
     duplex, out, happened = Duplex(EgoFilter(room_of.PROFILE, engine="crnn"), clock=clock), [], []
     for at in range(0, 6 * RATE, 320):

@@ -8,15 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import pywebrtc_audio
-import soundfile
 import soxr
 
-import edgefilter
 from edgefilter import EchoCanceller, SignalError, UsageError
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.types import Event
+from tests.program import DEMO, demo
 
-DEMO = Path(edgefilter.__file__).parent / "demo_data"
 PAGE = (Path(__file__).parents[2] / "docs/echo_canceller.md").read_text()
 RATES = (8000, 11025, 16000, 22050, 24000, 32000, 44100, 48000)
 NOISE = (0.1 * np.random.default_rng(0).standard_normal((4800, 2))).astype(np.float32)
@@ -166,7 +164,7 @@ def test_a_canceller_that_cannot_be_is_one_line(words, said):
 @pytest.fixture(scope="module")
 def conversation():
     """Microphone, reference and the human alone: the robot talks, from 9.5 s on the human with it."""
-    return [soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference", "human")]
+    return demo("mic", "reference", "human")
 
 
 def hear(canceller, rate, mic, ref):

@@ -5,7 +5,6 @@ import signal
 import subprocess
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,9 +26,8 @@ from edgefilter.cli import main
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.types import SAMPLE_RATE as RATE
-from tests.program import argv
+from tests.program import ROOT, argv
 
-ROOT = Path(__file__).parents[2]
 PROFILE = ROOT / "edgefilter/demo_data/profile.npz"
 FRAME = 320
 

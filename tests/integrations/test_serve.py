@@ -19,12 +19,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import soundfile
 import soxr
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-import edgefilter
 from edgefilter import EgoFilter, SignalError, enhance
 from edgefilter.cli import main
 from edgefilter.dsp.metrics import si_sdr
@@ -34,10 +32,8 @@ from edgefilter.integrations.opus import Decoder, Encoder
 from edgefilter.integrations.serve import Service
 from edgefilter.integrations.wire import HEADER, Form, Limits, TwoStreams
 from edgefilter.types import SAMPLE_RATE as RATE
-from tests.program import argv
+from tests.program import DEMO, ROOT, argv, demo
 
-ROOT = Path(__file__).parents[2]
-DEMO = Path(edgefilter.__file__).parent / "demo_data"
 MICROPHONE, REFERENCE = 0, 1
 BOTH = slice(9 * RATE, 15 * RATE)
 """Where human and robot talk at once in the bundled conversation."""
@@ -46,7 +42,7 @@ BOTH = slice(9 * RATE, 15 * RATE)
 @pytest.fixture(scope="module")
 def conversation():
     """Microphone, reference and the human alone, 16 s."""
-    return [soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference", "human")]
+    return demo("mic", "reference", "human")
 
 
 def pcm(x):

@@ -18,8 +18,8 @@ from edgefilter.dsp.metrics import si_sdr
 from edgefilter.dsp.resample import Resampler
 from edgefilter.profile.array import ArrayCalibration
 from edgefilter.types import SAMPLE_RATE as RATE
+from tests.program import ROOT
 
-ROOT = Path(__file__).parents[2]
 PROGRAM = Path(__file__).with_name("sic_program.py")
 PROFILE = ROOT / "edgefilter/demo_data/profile.npz"
 

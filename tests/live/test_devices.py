@@ -11,12 +11,11 @@ import soundfile
 import soxr
 
 from tests.filter.array_scene import calibration
-from tests.program import argv
+from tests.program import ROOT, argv
 
 pytestmark = pytest.mark.slow
 
 SESSION = Path(__file__).with_name("session.py")
-ROOT = Path(__file__).parents[2]
 QUIET = 8000  # samples of silence first: a sound server swallows the first milliseconds of a stream
 
 
