@@ -32,7 +32,6 @@ RESULTS = Path(__file__).parent / "results"
 PAGES = (ROOT / "README.md", ROOT / "docs" / "index.md", ROOT / "bench" / "README.md")
 """Pages that quote tables: <!-- table: FILE/TABLE --> ... <!-- end -->."""
 QUOTED = re.compile(r"(<!-- table: (\w+)/([\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
-CHUNK = 1 << 20
 
 
 # ---------------------------------------------------------------- what code, data and machine are
@@ -41,14 +40,16 @@ CHUNK = 1 << 20
 def digest(path: Path) -> dict:
     """Number of files, bytes and sha256 of a folder (names and contents) or a file; raises UsageError for nothing."""
     if path.is_file():
-        return {"files": 1, "bytes": path.stat().st_size, "sha256": _sha256(path).hexdigest()}
+        return {"files": 1, "bytes": path.stat().st_size, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
     files = sorted((p for p in path.rglob("*") if p.is_file()), key=lambda p: p.relative_to(path).as_posix())
     if not files:
         raise UsageError(f"{path} holds no file, expected the data that this result is made from: check the path")
     whole, size = hashlib.sha256(), 0
     for file in files:
-        whole.update(f"{file.relative_to(path).as_posix()}\0{file.stat().st_size}\0".encode() + _sha256(file).digest())
-        size += file.stat().st_size
+        content = file.read_bytes()
+        name = f"{file.relative_to(path).as_posix()}\0{len(content)}\0".encode()
+        whole.update(name + hashlib.sha256(content).digest())
+        size += len(content)
     return {"files": len(files), "bytes": size, "sha256": whole.hexdigest()}
 
 
@@ -56,7 +57,7 @@ def code_digest(files: Iterable[Path] | None = None) -> str:
     """sha256 over the package's Python files, or over these files."""
     package = Path(engines.__file__).parents[1]
     chosen = sorted(package.rglob("*.py")) if files is None else list(files)
-    return hashlib.sha256(b"".join(_sha256(path).digest() for path in chosen)).hexdigest()
+    return hashlib.sha256(b"".join(hashlib.sha256(path.read_bytes()).digest() for path in chosen)).hexdigest()
 
 
 def revision() -> tuple[str, bool]:
@@ -76,14 +77,6 @@ def machine() -> dict[str, str]:
     """Processor, threads, system, Python and package versions."""
     threads = os.environ.get("OMP_NUM_THREADS") or f"not limited, {os.cpu_count()} cores"
     return {"processor": processor(), "threads": threads, "system": platform.system(), **versions(PACKAGES)}
-
-
-def _sha256(path: Path) -> hashlib._Hash:
-    found = hashlib.sha256()
-    with path.open("rb") as file:
-        while chunk := file.read(CHUNK):
-            found.update(chunk)
-    return found
 
 
 # ---------------------------------------------------------------- what a result holds

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import soundfile
 
+from edgefilter.session import level_db as db
 from edgefilter.types import SAMPLE_RATE as RATE
 from tests.program import DEMO, ROOT, argv
 
@@ -32,10 +33,6 @@ def run(name, *words, stdin=None):
 
 def read(path):
     return soundfile.read(path, dtype="float32")[0]
-
-
-def db(x):
-    return 10 * np.log10(np.mean(np.square(x, dtype=np.float64)) + 1e-12)
 
 
 @pytest.fixture(scope="module")

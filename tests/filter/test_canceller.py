@@ -10,16 +10,13 @@ from scipy import signal
 
 from edgefilter.errors import SignalError
 from edgefilter.filter.canceller import COLD, LEARNED, Canceller, CancellerOutput, ShelfStates
+from edgefilter.session import level_db as db
 from tests.filter.canceller_scene import path, run, speechlike
 from tests.learning.scenes import loudspeaker, voice
 
 HOP = 256
 SETTLED = 6 * HOP
 """After 0.1 s the echo is raised by the shelf as if it had always been, to float32's precision."""
-
-
-def db(x: np.ndarray) -> float:
-    return float(10 * np.log10(np.mean(np.square(x, dtype=np.float64)) + 1e-20))
 
 
 @pytest.mark.parametrize("hop", [160, 256, 200])

@@ -14,6 +14,7 @@ from edgefilter.filter.budget import DEMO
 from edgefilter.filter.echo_path import PathState, PathUpdate
 from edgefilter.filter.front_end import RUMBLE, FrontEnd
 from edgefilter.filter.residual_echo import Residual
+from edgefilter.session import level_db
 from edgefilter.types import SAMPLE_RATE
 from tests.conformance import robot
 from tests.program import demo
@@ -112,48 +113,6 @@ def test_a_lesson_is_faded_in_over_the_hop_in_which_it_is_adopted():
     assert np.array_equal(taught.linear.error, taught.heard - taught.linear.echo)
 
 
-class Leaking:
-    """A linear stage whose error holds so much of the echo's power, the same in all bins; the noise is known."""
-
-    def __init__(self, profile=None, noise=1e-6):
-        self.stft = Linear().stft
-        self.residual, self.noise = Residual(self.stft, profile), np.full(self.stft.bins, noise, np.float32)
-
-    def expected(self, error=0.0, frames=1, echo=1.0, uncertainty=0.0):
-        """The residual echo that is expected after so many frames."""
-        whole = np.ones(self.stft.bins, np.complex64)
-        for _ in range(frames):
-            uncertain = np.full(self.stft.bins, uncertainty, np.float32)
-            _, found = self.residual.step(echo**0.5 * whole, error**0.5 * whole, uncertain, fan=self.noise)
-        assert np.ptp(found) <= 1e-5 * found.max()
-        return float(found[0])
-
-
-def test_what_leaks_of_the_echo_falls_at_once_rises_slowly_and_is_held_within_bounds():
-    stage, whole = Leaking(), 1.1  # of what falls on other frequencies a tenth more is expected
-    assert stage.expected(frames=1) == pytest.approx(whole * 0.005 * 0.9, rel=1e-3)
-    assert stage.expected(frames=100) == pytest.approx(whole * 0.0024, rel=1e-3)
-    assert stage.expected(error=0.02) == pytest.approx(whole * 0.0024, rel=1e-3)  # a frame in half a second
-    assert stage.expected(error=1.0, frames=62) == pytest.approx(whole * 0.0024 * 1.005**62, rel=0.01)  # 1.3 dB in 1 s
-    assert stage.expected(error=1.0, frames=1000) == pytest.approx(whole * 0.1, rel=1e-3)
-    assert stage.expected(error=0.01 * whole, frames=1000) == pytest.approx(whole * 0.03, rel=1e-3)  # three times
-
-
-@pytest.mark.parametrize(("over_noise", "left"), [(59.5, 0.005), (60.5, 0.0024)])
-def test_leakage_is_only_told_where_the_echo_is_18_db_over_the_noise(over_noise, left):
-    assert Leaking(noise=1.1 / over_noise).expected(frames=100) == pytest.approx(1.1 * left, rel=1e-3)
-
-
-@pytest.mark.parametrize(("profile", "weight"), [(None, 2.0), (robot(), 0.5)], ids=["unknown", "calibrated"])
-def test_the_canceller_s_doubt_of_its_path_is_expected_as_echo_and_the_room_falls_by_two_decibels_a_hop(
-    profile, weight
-):
-    stage = Leaking(profile)
-    assert stage.expected(echo=0.0, uncertainty=3.0) == pytest.approx(3.0 * weight)
-    before = stage.expected()
-    assert [stage.expected(echo=0.0) / before for _ in range(2)] == pytest.approx([0.6, 0.36], rel=0.2)
-
-
 def test_an_offset_of_the_microphone_leaves_the_robot_removed_and_is_removed_itself():
     """-30 dB of full scale, as cheap microphones have: 5 to 7 dB less were removed, and the robot's path learned in vain."""
     mic, ref = demonstration()
@@ -181,7 +140,3 @@ def demonstration() -> tuple[np.ndarray, np.ndarray]:
     """Microphone and reference of the bundled robot, alone from 1 s to 6 s."""
     mic, ref = demo("mic", "reference")
     return mic[: 8 * SAMPLE_RATE], ref[: 8 * SAMPLE_RATE]
-
-
-def level_db(x: np.ndarray) -> float:
-    return float(10 * np.log10(np.mean(np.square(x))))

@@ -10,6 +10,7 @@ from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
 from edgefilter.filter.canceller import Canceller
 from edgefilter.filter.echo_path import EchoPath
+from edgefilter.session import level_db as db
 from edgefilter.types import PRE_ROLL
 from tests.conformance import robot
 from tests.diagnosis.robot_scene import profile, record, voice
@@ -18,10 +19,6 @@ from tests.diagnosis.robot_scene import profile, record, voice
 def echo_of(profile, reference, delay=900):
     late = np.concatenate((np.zeros(delay - PRE_ROLL, np.float32), reference))[: reference.size]
     return profile.echo.predict(late)
-
-
-def db(x):
-    return 10 * np.log10(np.mean(np.square(x, dtype=np.float64)))
 
 
 @pytest.fixture

@@ -93,7 +93,3 @@ def run(scene, learner=None, block=4096, profile=None):
     ]
     kinds = [event.kind for event in ego.events()]
     return np.concatenate([*out, ego.flush()]), kinds, ego
-
-
-def db(x):
-    return 10 * np.log10(np.mean(np.square(x, dtype=np.float64)) + 1e-12)

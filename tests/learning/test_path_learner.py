@@ -6,8 +6,9 @@ import pytest
 from edgefilter import EgoFilter, PathLearner, Profile, ProfileError, enhance
 from edgefilter.filter.echo_path import starting_path
 from edgefilter.learning.path_learner import CandidatePath
+from edgefilter.session import level_db as db
 from edgefilter.types import SAMPLE_RATE
-from tests.learning.scenes import Scene, db, run
+from tests.learning.scenes import Scene, run
 
 
 def seconds(x):

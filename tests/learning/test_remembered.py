@@ -8,8 +8,9 @@ import pytest
 from edgefilter import PathLearner, Profile
 from edgefilter.echo.model import EchoModel
 from edgefilter.filter.echo_path import FilteredHop, starting_path
+from edgefilter.session import level_db as db
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE
-from tests.learning.scenes import Scene, db, room, run
+from tests.learning.scenes import Scene, room, run
 
 HOP = 256
 

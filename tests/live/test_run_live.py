@@ -13,6 +13,7 @@ import soundfile
 import soxr
 
 from edgefilter import Profile
+from edgefilter.session import level_db as db
 from tests.learning.scenes import Scene
 from tests.program import DEMO, ROOT, argv
 
@@ -59,10 +60,6 @@ def play_and_end(live, server, folder):
     written, said = live.communicate(timeout=60)
     assert live.returncode == 0 and "Traceback" not in said, said
     return written, said
-
-
-def db(x):
-    return 10 * np.log10(np.mean(np.square(x, dtype=np.float64)) + 1e-12)
 
 
 def test_live_run_takes_the_monitor_ends_by_ctrl_c_and_equals_the_file_path(server, conversation, tmp_path):
