@@ -144,8 +144,11 @@ class Aligner:
         self._by_bands = None if self._calibrated else CoarseLag(self.hop, self._max_lag)
         self._coarse = False  # whether a lag is followed at which nothing sharp arrives
         self._margin = PRE_ROLL
-        self._known = self._refuted = self._trusted = self._measured = self._missed = False
-        self._log_odds, self._lost = -SUREST, 0
+        self._known = self._refuted = self._measured = False
+        self._log_odds, self._lost = (
+            0.0,
+            0,
+        )  # of the delay; below 0 also where none is known and an utterance was not heard
         self._counts = AlignmentCounts(
             utterances=0, realignments=0, jumps=0, searches=0, announced=0, announced_heard=0
         )
@@ -237,7 +240,7 @@ class Aligner:
             return False
         self._coarse, self._margin = True, COARSE_MARGIN
         self._meter = DelayMeter()
-        self._drift.restart(float(found), 3.0)
+        self._drift.restart(float(found))
         return True
 
     def history(self, count: int) -> Samples:
@@ -277,7 +280,7 @@ class Aligner:
             return "idle"
         if self._open and self._known:
             return "lost"
-        return "unfound" if self._missed or not self._known else "locked"
+        return "locked" if self._known and self._log_odds >= 0.0 else "unfound"
 
     def _audible(self) -> bool:
         """Whether something of the reference can still be heard."""
@@ -288,19 +291,17 @@ class Aligner:
         """Give up utterances that would have been heard by now."""
         end = self._open[1].start if len(self._open) > 1 else self._onsets.current.end
         if self._ref.end > end + self._likely:
-            self._missed = True
+            self._log_odds = min(self._log_odds, -UNSEEN)
             if not self._known and self._responses is not None:  # it may stand elsewhere than where it was calibrated
                 self._steps = iter(())
                 self._listen_for(None)
         if self._ref.end > end + self._latest:
-            self._resolve(found=False)
-            self._missed = True
+            self._resolve()
 
-    def _resolve(self, found: bool = True) -> None:
+    def _resolve(self) -> None:
         self._open.popleft()
-        self._trusted = found
         self._steps = iter(())
-        self._refuted = self._missed = False
+        self._refuted = False
 
     def _search(self) -> bool:
         """A step of a search over all lags each hop, to be looked at by itself or for an utterance; True if the delay was switched."""
@@ -356,7 +357,7 @@ class Aligner:
         ref = self._expected or self._ref
         self._lags.prepare(ref, now, self._expected.start if self._expected else self._open[0].start)
         yield False
-        heard_out = self._open[0].after + int(self._drift.delay) if self._open and self._trusted else 0
+        heard_out = self._open[0].after + int(self._drift.delay) if self._open and self._probability > 0.5 else 0
         together = self._used if self._responses is not None else self._used[:1]
         self._lags.listen({at: self._mics[at] for at in together}, self._ref.end, heard_out)
         yield False
@@ -403,13 +404,13 @@ class Aligner:
             self._margin = max(round(delay - self._read_at), PRE_ROLL)
             self._meter = DelayMeter()  # the other has learned what arrives around the coarse lag
             self._gain = None
-        self._drift.restart(delay, 3.0)
+        self._drift.restart(delay)
         return self._switched()
 
     def _switched(self) -> bool:
         self._known, self._coarse = True, False
         self._counts["realignments"] += 1
-        self._lost, self._refuted, self._missed = 0, False, False
+        self._lost, self._refuted = 0, False
         self._to_measure = min(self._to_measure, 2 * self.hop)
         return True
 
@@ -441,7 +442,7 @@ class Aligner:
             self._log_odds = math.log(CERTAIN)
             if self._open and self._ref.end - drift.delay > self._open[0].start + STRIDE:
                 self._resolve()
-            drift.step(found.offset, 0.3)
+            drift.step(found)
             return self._switched()
         if seen == "elsewhere":
             self._to_measure = STRIDE // 2
@@ -452,13 +453,13 @@ class Aligner:
         step = self._drift.delay
         self._drift.correct(found)
         self._meter.confirm(found.offset)
-        self._lost, self._missed = 0, False
-        self._log_odds = min(self._log_odds + THERE, SUREST)
+        self._lost = 0
+        self._log_odds = min(max(self._log_odds, 0.0) + THERE, SUREST)
         before = found.gain if self._gain is None else self._gain
         self._gain = before + 0.1 * (min(found.gain, 2 * before) - before)
         was_refuted = self._refuted
         heard_out = self._open and self._ref.end - self._drift.delay > self._open[0].start + STRIDE
-        if self._known and heard_out and found.dominance < 1.01:
+        if self._known and heard_out and abs(found.offset) < DRIFTED:
             self._resolve()
         return was_refuted or abs(self._drift.delay - step) > 0.5
 
@@ -474,7 +475,6 @@ class Aligner:
             self._open.append(Utterance(self._ref.end, self._ref.end, nearby=NEARBY_SEARCHES, lost=True))
         elif self._gain is None and self._log_odds < 0.0:  # never confirmed: it may be wrong from the start
             self._open.append(Utterance(self._onsets.current.start, self._onsets.current.end, lost=True))
-        self._trusted = self._trusted and not self._open
 
     def _deliver(self, mic: Samples, before: float, switched: bool) -> Aligned:
         state, end, delay = self._state(), self._ref.end, self._drift.delay
@@ -509,7 +509,7 @@ class Aligner:
         Never after an utterance that failed to arrive: the loudspeaker may be muted, or be headphones.
         """
         waits = False
-        if self._open and not self._missed and self._ref.end <= self._open[0].start + self._likely:
+        if self._open and self._log_odds >= 0.0 and self._ref.end <= self._open[0].start + self._likely:
             waits = self._refuted or not (self._coarse or self._open[0].lost)
         if self._first is None:
             return waits and self._onsets.varies and (self._refuted or not self._known)

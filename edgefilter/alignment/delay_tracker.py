@@ -59,16 +59,15 @@ class DelayMeasurement:
     """What one look at a delay found.
 
     offset: delay error, samples (positive: the microphone is later). variance: of the offset, samples^2. strength: height
-    of the peak over the rms of all lags. ratio: height over the highest peak elsewhere. dominance: height over the best
-    within 2 samples of the expected delay. explained: share of the microphone's whitened power that the early response
-    explains, 0 to 1. gain: power ratio of microphone to reference; gain_there: the same if the offset is true.
+    of the peak over the rms of all lags. ratio: height over the highest peak elsewhere. explained: share of the microphone's
+    whitened power that the early response explains, 0 to 1. gain: power ratio of microphone to reference; gain_there: the
+    same if the offset is true.
     """
 
     offset: float
     variance: float
     strength: float
     ratio: float
-    dominance: float
     explained: float
     gain: float
     gain_there: float
@@ -95,7 +94,6 @@ class DelayMeter:
         self._omega_squared = np.square(self._omega)
         band = (self._omega > 2 * np.pi * 120 / 16000) & (self._omega < 2 * np.pi * 7000 / 16000)
         self._band, self._band_size = band.astype(np.float32), float(np.count_nonzero(band))
-        self._ramp = np.arange(-SIZE // 2, SIZE // 2, dtype=np.float32)
         self._framed = np.zeros((3, SIZE), np.float32)
         self._prior = np.ones(self._omega.size, np.complex64)
         self._prior_blocks = 4.0
@@ -124,7 +122,7 @@ class DelayMeter:
         start = now - FRAME - REACH - whole
         x, inner, wide = self._framed
         np.multiply(mic.read(now - FRAME, now), self._window, out=x[REACH:-REACH])
-        self._reference(ref, start, slope, wide)
+        wide[:] = ref.read(start, start + SIZE)
         np.multiply(wide[REACH:-REACH], self._window, out=inner[REACH:-REACH])
         energy, drive = float(x.dot(x)), float(inner.dot(inner))
         if not (drive > FLOOR and energy > 0.0):
@@ -143,7 +141,7 @@ class DelayMeter:
         m *= weight
         products, references = [m * np.conj(w)], [wide]
         if far:
-            sides = [self._reference(ref, start + x, slope, np.empty_like(wide)) for x in (2 * REACH, -2 * REACH)]
+            sides = [ref.read(start + x, start + x + SIZE) for x in (2 * REACH, -2 * REACH)]
             before, after = (m * np.conj(fourier.rfft(side)) for side in sides)
             products, references = [before, *products, after], [sides[0], wide, sides[1]]
         correlation = fourier.irfft(np.array(products), SIZE)
@@ -151,9 +149,8 @@ class DelayMeter:
         overlap = np.concatenate([_overlap(reference) for reference in references])
         likelihood /= np.sqrt(overlap + 0.1 * overlap.max())
         expected = likelihood.size // 2
-        near = float(likelihood[expected - 2 : expected + 3].max())
-        at, peak, strength, ratio = max(
-            (_highest(likelihood, reach) for reach in {REACH, expected}), key=lambda found: found[2] * found[3]
+        at, strength, ratio = max(
+            (_highest(likelihood, reach) for reach in {REACH, expected}), key=lambda found: found[1] * found[2]
         )
         part, inside = divmod(at, 2 * REACH)
         offset = at - inside + REACH - expected + climb(products[part], self._omega, inside - REACH, steps=3)
@@ -165,22 +162,10 @@ class DelayMeter:
             variance=4.0 / (information + 1e-30) + 1e-4,
             strength=strength,
             ratio=ratio,
-            dominance=peak / max(near, 1e-20),
             explained=min(max(explained, 0.0), 1.0),
             gain=energy / drive,
             gain_there=energy / (float(there.dot(there)) + 1e-30),
         )
-
-    def _reference(self, ref: DelayBuffer, start: int, slope: float, out: Samples) -> Samples:
-        """SIZE samples of the reference from start on, the drift about their middle undone by the first term of a Taylor series."""
-        x = ref.read(start - 2, start + SIZE + 2)
-        np.subtract(x[3:-1], x[1:-3], out=out)
-        out *= 8.0
-        out += x[:-4]
-        out -= x[4:]
-        out *= self._ramp * (slope / -12.0)
-        out += x[2:-2]
-        return out
 
     def confirm(self, offset: float) -> None:
         """The last measurement was believed, with this offset: `learn`, when there is time, takes it into the response."""
@@ -219,15 +204,15 @@ class DelayMeter:
         self.response = self._prior * np.float32(scale)
 
 
-def _highest(likelihood: Samples, reach: int) -> tuple[int, float, float, float]:
-    """Index of the highest peak at most reach from the middle, its height, strength and ratio among the lags there."""
+def _highest(likelihood: Samples, reach: int) -> tuple[int, float, float]:
+    """Index of the highest peak at most reach from the middle, and its strength and ratio among the lags there."""
     first = likelihood.size // 2 - reach
     inner = likelihood[first : first + 2 * reach]
     at = int(inner.argmax())
     peak = float(inner[at])
     elsewhere = max(inner[: max(at - NEAR, 0)].max(initial=0.0), inner[at + NEAR :].max(initial=0.0))
     rms = math.sqrt(float(inner.dot(inner)) / inner.size)
-    return first + at, peak, peak / (rms + 1e-20), peak / max(float(elsewhere), 1e-20)
+    return first + at, peak / (rms + 1e-20), peak / max(float(elsewhere), 1e-20)
 
 
 def _overlap(reference: Samples) -> Samples:
@@ -251,26 +236,26 @@ class DriftFilter:
     def __init__(self) -> None:
         self.slope, self._slope_variance = 0.0, SLOPE_DEVIATION**2
         self._witness = JumpWitness()
-        self.restart(float("nan"), float("nan"))  # nothing is known of a delay
+        self.restart(float("nan"))  # nothing is known of a delay
 
     @property
     def deviation(self) -> float:
         """Standard deviation of the delay, samples."""
         return math.sqrt(self._variance)
 
-    def restart(self, delay: float, deviation: float) -> None:
-        """Another delay, known to +-deviation samples; the slope stays, the clocks are the same."""
+    def restart(self, delay: float, deviation: float = SMALL / EXPECTED) -> None:
+        """Another delay, known to +-deviation samples; the slope stays, the clocks are the same. A search finds it to within SMALL."""
         self.delay = delay
         self._variance, self._covariance = deviation**2, 0.0
         self._since = 0
         self._witness.forget()
 
-    def step(self, offset: float, deviation: float) -> None:
+    def step(self, found: DelayMeasurement) -> None:
         """The delay is another one by an offset; a small one may come from a wrong slope since the last look as well as from a jump."""
-        wrong = offset / max(self._since, STRIDE)
-        if abs(offset) <= SMALL and abs(self.slope + wrong) < UNEXPECTED * SLOPE_DEVIATION:
+        wrong = found.offset / max(self._since, STRIDE)
+        if abs(found.offset) <= SMALL and abs(self.slope + wrong) < UNEXPECTED * SLOPE_DEVIATION:
             self._slope_variance = min(self._slope_variance + wrong**2, SLOPE_DEVIATION**2)
-        self.restart(self.delay + offset, deviation)
+        self.restart(self.delay + found.offset, math.sqrt(self._noise(found)))
 
     def advance(self, samples: int) -> None:
         """Let `samples` samples pass."""
@@ -342,7 +327,7 @@ class DriftFilter:
 class JumpWitness:
     """Remembers the most suspicious jump of late, and how much more likely than chance it makes what was seen.
 
-    >>> look = DelayMeasurement(100.0, 0.01, strength=10.0, ratio=1.6, dominance=5.0, explained=0.5, gain=1.0, gain_there=1.0)
+    >>> look = DelayMeasurement(100.0, 0.01, strength=10.0, ratio=1.6, explained=0.5, gain=1.0, gain_there=1.0)
     >>> witness = JumpWitness()
     >>> witness.convinced(look), witness.convinced(look)
     (False, True)

@@ -210,7 +210,7 @@ def test_a_faint_agreement_while_the_robot_is_muted_is_no_jump():
 
 
 def test_a_missed_look_or_another_suspicion_does_not_undo_a_jump_that_is_seen_again():
-    look = DelayMeasurement(100.0, 0.01, 10.0, 1.6, 5.0, 0.5, 1.0, 1.0)
+    look = DelayMeasurement(100.0, 0.01, 10.0, 1.6, 0.5, 1.0, 1.0)
     other = replace(look, offset=-300.0, strength=8.0, ratio=1.1)
     witness = JumpWitness()
     assert (
@@ -456,8 +456,6 @@ def test_where_no_measurement_sees_the_robot_its_arrival_is_studied_once_it_is_f
 
 
 def test_one_look_is_not_enough_for_a_far_jump_however_clear_it_is():
-    look = DelayMeasurement(
-        312.0, 0.01, strength=13.7, ratio=3.2, dominance=6.8, explained=0.0, gain=1.0, gain_there=1.0
-    )
+    look = DelayMeasurement(312.0, 0.01, strength=13.7, ratio=3.2, explained=0.0, gain=1.0, gain_there=1.0)
     witness = JumpWitness()
     assert not witness.convinced(look) and witness.convinced(look)

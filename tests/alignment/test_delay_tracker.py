@@ -20,7 +20,7 @@ def look(
     explained: float = 1.0,
 ) -> DelayMeasurement:
     """One that is sure of its offset."""
-    return DelayMeasurement(offset, 1e-6, strength, ratio, 5.0, explained, gain, gain_there)
+    return DelayMeasurement(offset, 1e-6, strength, ratio, explained, gain, gain_there)
 
 
 def seen(found: DelayMeasurement, deviation: float = 0.1, far: bool = False) -> str:
@@ -179,7 +179,7 @@ def test_belief_is_widened_where_a_look_contradicts_it_but_not_beyond_that_of_th
 def test_a_small_jump_may_come_from_a_wrong_slope_since_the_last_look(after, offset, wrong_ppm):
     drift = steady()
     drift.advance(after * STRIDE)
-    drift.step(offset, 0.3)
+    drift.step(replace(look(offset), variance=0.09))
     drift.advance(16 * STRIDE)
     assert drift.delay == pytest.approx(1000.0 + offset, abs=0.01)
     assert drift.deviation == pytest.approx(np.hypot(0.3, 16 * STRIDE * 1e-6 * wrong_ppm), rel=0.02)
@@ -187,7 +187,7 @@ def test_a_small_jump_may_come_from_a_wrong_slope_since_the_last_look(after, off
 
 @pytest.mark.parametrize("level", [1.0, 1e-3])
 @pytest.mark.parametrize(("far", "error"), [(False, 0.0), (False, 60.0), (False, -60.0), (True, 900.0), (True, -900.0)])
-def test_a_look_finds_how_far_the_delay_is_off_and_whether_another_place_is_the_better_one(far, error, level) -> None:
+def test_a_look_finds_how_far_the_delay_is_off_and_stands_out_there(far, error, level) -> None:
     """Of noise and its echo, as late by 500 samples and the error."""
     rng = np.random.default_rng(3)
     sound = (0.1 * level * rng.standard_normal(32_000)).astype(np.float32)
@@ -196,7 +196,7 @@ def test_a_look_finds_how_far_the_delay_is_off_and_whether_another_place_is_the_
     mic.push(np.roll(sound, 500 + round(error)))
     found = DelayMeter().measure(mic, ref, 30_000, 500.0, 0.0, far)
     assert found is not None and found.offset == pytest.approx(error, abs=0.05)
-    assert found.dominance == pytest.approx(1.0) if error == 0.0 else found.dominance > 2.0
+    assert found.strength > 20.0 and found.ratio > 2.0
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -24,7 +24,7 @@ CLOSE = 16  # the requirement: +-1 ms
 def look(offset, evidence=30.0, explained=0.1, gain=0.3):
     """What the meter says in double talk: sure of its peak, which explains little of the microphone."""
     ratio = 2.5
-    return DelayMeasurement(offset, 0.05**2, evidence / ratio, ratio, 1.0, explained, gain, 0.3)
+    return DelayMeasurement(offset, 0.05**2, evidence / ratio, ratio, explained, gain, 0.3)
 
 
 def see(drift, delay, evidence=30.0):
@@ -100,7 +100,7 @@ def test_a_jump_just_after_a_look_says_nothing_of_the_clocks_and_one_after_a_pau
             drift.advance(STRIDE)
             drift.correct(look(1000.0 - drift.delay))
         drift.advance(pause)
-        drift.step(3.0, 0.3)
+        drift.step(look(3.0))
         drift.advance(10 * RATE)
         return drift.deviation
 
