@@ -201,3 +201,37 @@ def test_what_sounds_with_the_voice_in_other_bins_is_expected_while_nobody_speak
     residual.nobody_speaks = False
     motor[151] = 10.0
     assert expected(200) == pytest.approx(later, rel=0.02)
+
+
+def test_what_sounds_with_the_voice_rises_by_a_twentieth_a_hop_is_forgotten_by_a_fiftieth_and_lasts_half_a_db_longer() -> (
+    None
+):
+    """So that a human who has not been noticed yet hardly raises it, and pauses between words do not end it."""
+    echo, motor, fan = np.zeros((3, STFT.bins), np.float32)
+    echo[20:60], motor[150:154], fan[:] = 1.0, 0.1, 1e-6
+    residual = Residual(STFT)
+    residual.nobody_speaks = True
+
+    def expected(frames: int) -> float:
+        for _ in range(frames):
+            _, left = residual.step(spectrum(echo), spectrum(motor + fan), NOTHING, fan=fan)
+        return float(left[151])
+
+    settled = expected(500)
+    motor[151] = 10.0
+    assert expected(12) == pytest.approx(1.05**12 * settled, rel=0.02)
+    motor[151] = 0.0
+    assert expected(34) == pytest.approx(0.98**34 * 1.05**12 * settled, rel=0.03)
+    residual.nobody_speaks = False
+    before = expected(1)
+    echo[:] = 0.0
+    assert expected(10) == pytest.approx(0.9**10 * before, rel=0.03)
+
+
+def test_noise_that_begins_with_the_voice_is_at_first_as_much_as_stays_of_the_echo_spread_over_all_bins() -> None:
+    echo, motor, fan = np.zeros((3, STFT.bins), np.float32)
+    echo[20:60], motor[150:154], fan[:] = 1.0, 1e3, 1e-6
+    residual = Residual(STFT)
+    residual.nobody_speaks = True
+    residual.step(spectrum(echo), spectrum(motor + fan), NOTHING, fan=fan)
+    assert residual.with_voice[151] == pytest.approx(1.05 * 0.005 / STFT.bins, rel=1e-3)
