@@ -14,6 +14,7 @@ from edgefilter.commands.recordings import load, load_array
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.recording import Recording
 from edgefilter.diagnosis.result import Diagnosis, in_order
+from edgefilter.echo.effect import vanishes
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.effects.catalogue import names as known_effects
 from edgefilter.errors import EdgefilterError, SignalError, UsageError
@@ -98,14 +99,13 @@ def _apply(
     """Write the profile with all effects that were found: what was fitted, and the error that kept it from being written.
 
     One of the two is None, and both where nothing was found: the diagnosis is printed in any case. A profile made from the
-    recording gets the whole length of the room's response, from all of the recording. array: the other microphones, which get
-    the same effects on their own paths.
+    recording, whose path is a quarter of a second, gets the whole length of the room's response. array: the other
+    microphones, which get the same effects on their own paths.
     """
     step("fit of what was found, and proof in the running filter")
     names = [finding.effect for finding in in_order(found.ranking)]
     if not recording.known:
-        # a path of a quarter of a second was made from the recording
-        names += [name for name in known_effects() if find(name).lengthens]
+        names += [name for name in known_effects() if name not in names and _lengthens(recording, found, name)]
     if not names:
         return None, None
     try:
@@ -114,6 +114,14 @@ def _apply(
         return None, error
     replace(applied.profile, array=array or applied.profile.array).save(args.apply)
     return applied, None
+
+
+def _lengthens(recording: Recording, found: Diagnosis, name: str) -> bool:
+    """Whether that effect adds to the impulse response what the recording shows beside what was found."""
+    effect, others = find(name), found.model.without_effect(name)
+    if effect.stage != "response" or effect.event:
+        return False
+    return not vanishes(effect, recording.straightened.fitted(name, others))
 
 
 def _written(args: argparse.Namespace, found: Diagnosis, following: str) -> tuple[str, str]:

@@ -418,7 +418,7 @@ def prove(
     >>> profile = calibrate(sweep, 0.5 * np.roll(sweep, 300) + fan(sweep.size), fan(64_000))
     >>> said = (0.2 * rng.standard_normal(80_000) * np.repeat(rng.uniform(size=25) > 0.3, 3200)).astype(np.float32)
     >>> heard = 0.5 * np.roll(said, 300) + 0.2 * np.roll(said, 900) + fan(said.size)
-    >>> proof = prove(profile, "late_reverb", heard, said)
+    >>> proof = prove(profile, "early_path", heard, said)
     >>> proof.worse, proof.erle_after_db > proof.erle_before_db + 3
     (False, True)
     """

@@ -7,6 +7,7 @@ from typing import ClassVar, Literal, Protocol, TypeAlias, get_args
 
 import numpy as np
 
+from edgefilter.dsp.fractional_delay import interpolate
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.errors import UsageError
 from edgefilter.types import Array, Samples
@@ -72,7 +73,6 @@ class Effect:
     title: how it reads inside a sentence ("a turned volume"); by default the name. complexity: of two effects that
     explain about as much the lower one is named. flexible: whether it has so many numbers that it takes up what a simpler
     effect beside it does. free: whether it is the law of a family rather than an effect (free_laws.py): no search tries it.
-    lengthens: whether it makes a path longer than a recording teaches at first.
     """
 
     name: ClassVar[str]
@@ -89,15 +89,10 @@ class Effect:
     complexity: ClassVar[int] = 3
     flexible: ClassVar[bool] = False
     free: ClassVar[bool] = False
-    lengthens: ClassVar[bool] = False
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
         """The signal (n,) after the effect; x is not written to. By default x itself, as for an effect of stage "noise"."""
         return x.copy()
-
-    def read_at(self, values: Values, size: int, sample_rate: int) -> Array:
-        """For an effect of stage "time" that only shifts sound in time: where in x each of its output samples is read, (size,), rising."""
-        return np.arange(float(size))
 
     def run(self, values: Values, sample_rate: int) -> Runner | None:
         """The effect on a stream, for one that remembers much or follows what the microphone hears; None: apply is all there is."""
@@ -192,14 +187,24 @@ class Effect:
         return self.adds_noise and not self.followed
 
     @property
-    def only_moves(self) -> bool:
-        """Whether a recording can be read as it was ahead of it."""
-        return self.stage == "time" and type(self).read_at is not Effect.read_at
-
-    @property
     def timed(self) -> bool:
         """Whether what it does depends on when the recording began."""
         return self.event or self.stage == "time"
+
+
+class Shift(Effect):
+    """An effect that only shifts sound in time, so that a recording can be read as it was ahead of it."""
+
+    stage = "time"
+    family = "time"
+
+    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
+        """The signal x (n,), read at other moments."""
+        return x.copy() if vanishes(self, values) else interpolate(x, self.read_at(values, x.size, sample_rate))
+
+    def read_at(self, values: Values, size: int, sample_rate: int) -> Array:
+        """Where in x each of its output samples is read, (size,), rising."""
+        raise NotImplementedError
 
 
 def neutral(effect: Effect) -> dict[str, float]:

@@ -9,8 +9,11 @@ import scipy
 from numpy.typing import NDArray
 
 from edgefilter.dsp.lag import climb
+from edgefilter.echo.measurement import Measurement, VoiceModel
 from edgefilter.types import Array, Samples
 
+BLOCK, REACH = 4000, 2400
+"""Samples of a block and of lag either way: a quarter of a second tells a lag, and 150 ms are the longest jump that is found."""
 LEAST_CORRELATION = 0.3
 """Blocks whose normalised correlation at the best lag is below this say nothing about the lag."""
 
@@ -32,6 +35,11 @@ class LagTrack:
     def middle(self) -> Array:
         """The middle of each block, (b,) in samples."""
         return self.starts + self.size / 2
+
+
+def lags_of(measurement: Measurement, model: VoiceModel) -> LagTrack:
+    """The lags of a recording behind what a model predicts, in BLOCKs that may be fitted to; what several fits share."""
+    return track_lag(measurement.predicted(model)[1], measurement.white_recording, measurement.fit, BLOCK, REACH)
 
 
 def track_lag(predicted: Samples, recording: Samples, fit: NDArray[np.bool_] | None, size: int, reach: int) -> LagTrack:

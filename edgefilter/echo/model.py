@@ -11,7 +11,7 @@ from typing import TypeAlias
 import numpy as np
 
 from edgefilter.dsp.convolution import filtered
-from edgefilter.echo.effect import RECORDING, Effect, complete, vanishes
+from edgefilter.echo.effect import RECORDING, Effect, Shift, complete, vanishes
 from edgefilter.echo.effects.catalogue import chain, find
 from edgefilter.echo.measurement import Measurement, Values
 from edgefilter.echo.running import is_filter
@@ -207,13 +207,14 @@ class EchoModel:
     @cached_property
     def still(self) -> EchoModel:
         """The model without the effects that only move what is heard in time; itself where it has none."""
-        return self._with_those(lambda name, _: not find(name).only_moves)
+        return self._with_those(lambda name, _: not isinstance(find(name), Shift))
 
     def read_at(self, size: int) -> Array:
         """Where in the prediction of `still` each sample of this model's prediction is read, (size,)."""
         read = n = np.arange(float(size))
         for effect, values in reversed(chain(self.effects)):
-            read = np.interp(read, n, effect.read_at(values, size, SAMPLE_RATE)) if effect.only_moves else read
+            if isinstance(effect, Shift):
+                read = np.interp(read, n, effect.read_at(values, size, SAMPLE_RATE))
         return read
 
     def lasting(self) -> EchoModel:

@@ -16,14 +16,14 @@ from typing import cast
 import numpy as np
 
 from edgefilter.dsp.psd import GRID_BINS
-from edgefilter.echo.effect import FAMILIES, STAGES, Effect, Parameter, complete, neutral
+from edgefilter.echo.effect import FAMILIES, STAGES, Effect, Parameter, Shift, complete, neutral
 from edgefilter.echo.effects.catalogue import names, register
 from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.types import SAMPLE_RATE
 
 REQUIRED = ("name", "stage", "parameters", "fit")
 """What no effect can do without; the rest has the defaults of Effect."""
-HOOKS = tuple(name for name, value in vars(Effect).items() if callable(value) and not name.startswith("_"))
+HOOKS = {name for kind in (Effect, Shift) for name, value in vars(kind).items() if callable(value) and name[0] != "_"}
 PROBE_SAMPLES = 4000
 """Of noise, on which neutral values must change nothing: a quarter of a second."""
 _loaded: dict[Path, str] = {}
@@ -84,7 +84,7 @@ def loaded_files() -> tuple[Path, ...]:
 
 def _guarded(path: Path, mine: type[Effect]) -> type[Effect]:
     """A subclass of the user's class: what its hooks raise becomes one line that names the file and the line in it, what they give is checked."""
-    own = [name for name in HOOKS if getattr(mine, name) is not getattr(Effect, name)]
+    own = [name for name in HOOKS if getattr(mine, name, None) is not getattr(Effect, name, None)]
     checks: dict[str, Callable] = {**_RESULTS, "run": functools.partial(_runner, path)}
     return type(
         mine.__name__, (mine,), {name: _in_one_line(path, getattr(mine, name), checks.get(name)) for name in own}

@@ -77,7 +77,7 @@ def fit_supported(x: Samples, target: Samples, weights: Samples, lead: int, prio
     half, taps = np.arange(x.size) // BLOCK % 4 < 2, prior.size
     trial = filtered(x, fit_filter(x, target, weights * half, taps, lead, prior, steps=20), lead)
     fall = float(np.dot(target * target - (target - trial) ** 2, weights * ~half))
-    return fit_filter(x, target, weights, taps, lead, prior, steps=40) if fall > 0.0 else np.zeros(taps)
+    return fit_filter(x, target, weights, taps, lead, prior, steps=20) if fall > 0.0 else np.zeros(taps)
 
 
 class _Blocks:

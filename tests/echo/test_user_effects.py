@@ -180,13 +180,12 @@ def test_what_a_users_class_says_of_itself_is_kept(write):
         ("stage, event = 'microphone', True", "scales_fan"),
         ("stage, family = 'microphone', 'dynamics'", "shows_in_silence"),
         ("stage, family = 'source', 'static nonlinearity'", "learned"),
-        ("stage, lengthens = 'path', True", "lengthens"),
         ("stage = 'microphone'", ""),
     ],
 )
 def test_what_follows_from_the_kind_of_a_users_effect(write, said, follows):
     load_effect(write(GOOD.replace('stage = "path"', said)))
-    marks = ("scales_fan", "shows_in_silence", "learned", "lengthens")
+    marks = ("scales_fan", "shows_in_silence", "learned")
     assert [mark for mark in marks if getattr(find("tilt"), mark)] == [follows] * bool(follows)
 
 

@@ -6,13 +6,13 @@ import numpy as np
 import scipy
 
 from edgefilter.dsp.fractional_delay import interpolate
-from edgefilter.echo.effect import Effect, Parameter, first, neutral, within
-from edgefilter.echo.lag_track import track_lag
+from edgefilter.echo.effect import Parameter, Shift, first, neutral, within
+from edgefilter.echo.lag_track import lags_of, track_lag
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
-from edgefilter.types import Array, Samples
+from edgefilter.types import Array
 
-PASSES = ((4000, 512), (8000, 16))
-"""Samples of a block and of lag either way: short blocks while the drift smears them, longer ones once it is taken out."""
+LONG, NEAR = 8000, 16
+"""Samples of a block and of lag either way once the drift is taken out, which smears blocks as long."""
 STEADY = 0.05
 """Samples by which a block's lag may err for other reasons than noise."""
 LEAST = 0.5
@@ -20,7 +20,7 @@ LEAST = 0.5
 beside faint distortion."""
 
 
-class ClockDrift(Effect):
+class ClockDrift(Shift):
     """y(n) = x(n - offset + ppm 1e-6 n): a delay that shrinks with positive, grows with negative ppm.
 
     Interpolation by a windowed sinc of 48 samples, see dsp.fractional_delay. Valid where the drift is constant over the
@@ -28,8 +28,6 @@ class ClockDrift(Effect):
     """
 
     name = "clock_drift"
-    stage = "time"
-    family = "time"
     run_note = (
         "the running filter follows the clocks by itself, whatever they did in this recording: adding it changes nothing"
         " there"
@@ -42,28 +40,23 @@ class ClockDrift(Effect):
         Parameter("offset", "samples", 0.0, -32000.0, 32000.0),
     )
 
-    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        still = not float(values["ppm"]) and not float(values["offset"])
-        return x.copy() if still else interpolate(x, self.read_at(values, x.size, sample_rate))
-
     def read_at(self, values: Values, size: int, sample_rate: int) -> Array:
         n = np.arange(size)
         return n - float(values["offset"]) + 1e-6 * float(values["ppm"]) * n
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """A robust line through the lags of all blocks, then once more on the prediction that it has straightened; neutral for one clock."""
-        (predicted, straight), recording = measurement.predicted(model), measurement.white_recording
-        n = np.arange(predicted.size)
-        lag: Array = np.zeros(predicted.size)
-        for size, reach in PASSES:
-            if lag.any():
-                straight = measurement.whiten(interpolate(predicted, n - lag))
-            track = track_lag(straight, recording, measurement.fit, size, reach)
+        track, n = measurement.once(lags_of, model), np.arange(measurement.recording.size)
+        lag: Array = np.zeros(n.size)
+        for last in (False, True):
             if track.lag.size < 3:
                 break
-            total = track.lag + np.interp(track.middle, n, lag)
-            slope, offset = robust_line(track.middle, total, track.sigma)
+            slope, offset = robust_line(track.middle, track.lag + np.interp(track.middle, n, lag), track.sigma)
             lag = offset + slope * n
+            if last or max(1e6 * abs(slope), abs(offset)) < LEAST:
+                break
+            straight = measurement.whiten(interpolate(measurement.predicted(model)[0], n - lag))
+            track = track_lag(straight, measurement.white_recording, measurement.fit, LONG, NEAR)
         if not n.size:
             return neutral(self)
         ppm = -1e6 * (lag[-1] - lag[0]) / max(n.size - 1, 1)

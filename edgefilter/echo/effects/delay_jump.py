@@ -7,12 +7,10 @@ import numpy as np
 from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.echo.effect import NEVER_S, Effect, Parameter, complete, neutral, numbers
 from edgefilter.echo.effects.clock_drift import STEADY, robust_line
-from edgefilter.echo.lag_track import LagTrack, track_lag
+from edgefilter.echo.lag_track import LagTrack, lags_of
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
-BLOCK, REACH = 4000, 2400
-"""Samples of a block and of lag either way: a quarter of a second tells a lag, and 150 ms are the longest jump that is found."""
 MOST_JUMPS = 8
 """More are another effect: a lag that moves all the time."""
 FADE = 512
@@ -72,7 +70,7 @@ class DelayJump(Effect):
         How many and how high comes from the samples to fit on; where exactly each lies from all, since it may fall between these.
         """
         predicted, recording = measurement.predicted(model)[1], measurement.white_recording
-        track = track_lag(predicted, recording, measurement.fit, BLOCK, REACH)
+        track = measurement.once(lags_of, model)
         if track.lag.size < 4:
             return neutral(self)
         edges, levels = find_steps(track.lag, np.hypot(track.sigma, STEADY))
@@ -146,6 +144,8 @@ def find_steps(lag: Array, sigma: Array) -> tuple[Array, Array]:
     """
     count = lag.size
     penalty = COST * np.log(count)
+    if _misfit(lag, float(np.median(lag)), sigma) <= penalty:  # no step can pay for itself
+        return np.zeros(0, int), np.array([_level(lag, sigma)])
     best, origin = np.full(count + 1, np.inf), np.zeros(count + 1, int)
     best[0] = -penalty
     for stop in range(1, count + 1):

@@ -32,11 +32,11 @@ class EarlyPath(AddedResponse):
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """What fit_path() finds, which late_reverb shares.
 
-        Neutral where none of it holds on other samples, where it is a gain of the direct sound, or where the room sounds longer.
+        Neutral where none of it holds on other samples, or where the room sounds longer.
         """
         added, _, longer = measurement.once(fit_path, model)
         grown = np.cumsum(added**2)
-        if longer or grown[PRE_ROLL] >= WITHIN * grown[-1]:
+        if longer or not grown[-1]:
             return neutral(self)
         level_db = 10.0 * np.log10(grown[-1] / np.sum(model.response().astype(float) ** 2) + 1e-12)
         within_ms = 1e3 * (int(np.searchsorted(grown, WITHIN * grown[-1])) - PRE_ROLL) / SAMPLE_RATE

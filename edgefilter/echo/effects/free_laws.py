@@ -9,11 +9,10 @@ from itertools import product
 from typing import ClassVar, TypeAlias
 
 import numpy as np
-from scipy.ndimage import map_coordinates
 
 from edgefilter.dsp.convolution import filtered
 from edgefilter.dsp.frames import block_power, block_sums, blocks, decibels
-from edgefilter.echo.effect import Effect, Parameter, Runner, Stage, first, neutral, numbers, vanishes, within
+from edgefilter.echo.effect import Effect, Parameter, Runner, Shift, Stage, first, neutral, numbers, vanishes, within
 from edgefilter.echo.effects.gain_fit import EXCERPT, STEP, loudest
 from edgefilter.echo.least_squares import hats, normal_equations
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
@@ -33,7 +32,7 @@ OVER_DB = (6.0, 15.0)
 """Over the loudest 20 ms that a step may reach, by its mean square and by its peak."""
 EXPONENTS = (1.0, 0.5, 0.1)
 """Of the power, in which a level is smoothed: detectors of power, of amplitude, and, nearly, of decibels."""
-FINER = (2.0, 1.4)
+FINER = (2.0, 1.4, 1.2)
 """Ratios of times that are tried next on either side of the best."""
 BEND = 1e-4
 """Weight of a curve's second differences, re the voice's mean energy at a knot: where speech hardly comes it goes on as beside it."""
@@ -418,12 +417,10 @@ class _Waves:
         return y.astype(np.float32)
 
 
-class FreeLag(FreeLaw):
+class FreeLag(FreeLaw, Shift):
     """x(t - lag(t)), the lag a curve of time: a clock that is pulled, buffers that are filled again, a robot that moves."""
 
     name = "free_lag"
-    stage = "path"
-    family = "time"
     title = "a lag that moves"
     event = True
     parameters = (Parameter("lag", "samples", 0.0, -1e5, 1e5),)  # a second from one to the next
@@ -431,15 +428,9 @@ class FreeLag(FreeLaw):
         "the running filter follows lags by itself, and this one was of this recording: adding it changes nothing there"
     )
 
-    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        if vanishes(self, values) or not x.size:
-            return x.copy()
-        n, lag = np.arange(x.size), numbers(values, "lag")
-        moved = n - np.interp(n / SAMPLE_RATE, np.arange(lag.size), lag)
-        return map_coordinates(x, [moved], order=5, mode="nearest").astype(np.float32)
-
-    def run(self, values: Values, sample_rate: int) -> Runner:
-        return lambda x, heard=None: x
+    def read_at(self, values: Values, size: int, sample_rate: int) -> Array:
+        n, lag = np.arange(size), numbers(values, "lag")
+        return n - np.interp(n / sample_rate, np.arange(lag.size), lag)
 
     def fitted(self, ground: _Ground) -> Values:
         middle = LAG_STEP * (np.arange(ground.x.size // LAG_STEP) + 0.5) / SAMPLE_RATE

@@ -195,3 +195,13 @@ def test_an_echo_of_some_milliseconds_is_no_longer_room() -> None:
     late, early = (room.fitted(name, measurement) for name in ("late_reverb", "early_path"))
     assert late["level_db"] == -120.0 and not np.any(late["added"])
     assert early["within_ms"] < 9.0
+
+
+def test_reflections_that_are_louder_up_to_60_ms_are_no_longer_room() -> None:
+    x, there = delayed(voice(12.0), DELAY - PRE_ROLL), somewhere(1)
+    here, direct = there.copy(), int(np.argmax(np.abs(there)))
+    here[direct + 320 : direct + 960] *= 2.0
+    heard = signal.fftconvolve(x, here)[: x.size] + FAN * np.random.default_rng(5).standard_normal(x.size)
+    moved, model = measure(heard.astype(np.float32), voice(12.0)), EchoModel(there)
+    late, early = (model.fitted(name, moved) for name in ("late_reverb", "early_path"))
+    assert late["level_db"] == -120.0 and early["level_db"] > -30.0
