@@ -74,7 +74,7 @@ class Fitted:
         """For the top of the page: term, value, explanation."""
         facts = []
         if self.found is None or self.found.written is None:
-            what = f"over the noise floor, with {joined(self.names)}"
+            what = f"over the noise floor, with {joined(self.names) or 'nothing added'}"
             facts.append(("Written", f"{decibels(self.after.excess_db)} dB", what))
         if proof := self.proof:
             erle = f"{decibels(proof.erle_before_db)} to {decibels(proof.erle_after_db)} dB"

@@ -106,7 +106,7 @@ def _apply(
     names = [finding.effect for finding in in_order(found.ranking)]
     if not recording.known:
         names += [name for name in known_effects() if name not in names and _lengthens(recording, found, name)]
-    if not names:
+    if recording.known and not names:
         return None, None
     try:
         applied = fit(recording, tuple(names), force=args.force, found=found)
@@ -119,9 +119,8 @@ def _apply(
 def _lengthens(recording: Recording, found: Diagnosis, name: str) -> bool:
     """Whether that effect adds to the impulse response what the recording shows beside what was found."""
     effect, others = find(name), found.model.without_effect(name)
-    if effect.stage != "response" or effect.event:
-        return False
-    return not vanishes(effect, recording.straightened.fitted(name, others))
+    added = effect.stage == "response" and not effect.event
+    return added and not vanishes(effect, recording.straightened.fitted(name, others))
 
 
 def _written(args: argparse.Namespace, found: Diagnosis, following: str) -> tuple[str, str]:

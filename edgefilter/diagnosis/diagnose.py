@@ -65,9 +65,8 @@ def conclude(
     believed = bool(found.steps) and _believed(found, criteria)
     quiet = found.base.excess_db < criteria.explained_db and not prepared.human
     verdict: Verdict = "missing" if found.steps and holds(found, criteria) else "explained" if quiet else "unexplained"
-    part = share_of(
-        found.base.excess_db, found.final.excess_db
-    )  # enough to be named beside something that none explains
+    # enough to be named beside something that none explains
+    part = share_of(found.base.excess_db, found.final.excess_db)
     partly = part >= criteria.half and explained_level(found) >= criteria.part
     if not believed and (quiet or not partly):
         shown = {step.name: step.values for step in found.steps if find(step.name).shows_in_silence}

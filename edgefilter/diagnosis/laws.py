@@ -15,8 +15,6 @@ from edgefilter.echo.effects.catalogue import EFFECTS, find
 from edgefilter.echo.effects.free_laws import FreeLaw
 from edgefilter.echo.measurement import Values
 
-MOST = 2
-"""Laws at once: a bound on the work."""
 FILE = '''"""{title}, as `edgefilter diagnose` found it: {words}."""
 
 import numpy as np
@@ -83,7 +81,8 @@ class Law:
 
     def file(self, name: str) -> str:
         """The text of a Python file that defines this law as an effect called `name`."""
-        known = ((key, value) for key, value in self.values.items() if not _given(self.effect, key))
+        given = {parameter.name for parameter in find(self.effect).parameters if parameter.given}
+        known = ((key, value) for key, value in self.values.items() if key not in given)
         return FILE.format(
             title=f"{self.family[:1].upper()}{self.family[1:]}",
             words=self.words,
@@ -123,34 +122,33 @@ def with_laws(
     progress: Callable[[str], None] | None = None,
     without: Collection[str] = (),
 ) -> Found:
-    """What a search has found, with the laws without which it leaves much of the recording.
+    """What a search has found, with the law without which it leaves much of the recording.
 
     A law beside all names has to be there by more than chance; one in place of the names of its family, which is known
     to be there, has to predict more than they do. It is preferred only where it explains much more. What the law makes
     superfluous is dropped. None is looked for where the names leave as little as those of right ones do.
     """
     bench = Workbench(found.recording, criteria, progress, without, found.start)
-    for _ in range(MOST):
-        left = max(found.final.over_db - found.final.floor_db, 0.0)
-        if found.final.excess_db <= (criteria.little_db if found.steps else criteria.explained_db):
-            break
-        names = {step.name for step in found.steps}
-        tried = [law for law in _trials(bench, found, without) if law.gain_db >= criteria.part * left]
-        instead = [law for law in tried if not names <= dict(law.model.effects).keys()]
-        beside = [law for law in tried if law not in instead and bench.admissible(law)]
-        most = criteria.nearly * max((law.gain_db for law in (*instead, *beside)), default=0.0)
-        choices = [law for law in beside if law.gain_db >= most] or [*instead, *beside]
-        if not choices:
-            break
-        law = max(choices, key=lambda law: law.gain_db)
-        found = _with(found, replace(law, model=without_superfluous(bench, found.start, law.model, law.name)))
-    return found
+    left = max(found.final.over_db - found.final.floor_db, 0.0)
+    if found.final.excess_db <= (criteria.little_db if found.steps else criteria.explained_db):
+        return found
+    names = {step.name for step in found.steps}
+    tried = [law for law in _trials(bench, found, without) if law.gain_db >= criteria.part * left]
+    instead = [law for law in tried if not names <= dict(law.model.effects).keys()]
+    beside = [law for law in tried if law not in instead and bench.admissible(law)]
+    most = criteria.nearly * max((law.gain_db for law in (*instead, *beside)), default=0.0)
+    choices = [law for law in beside if law.gain_db >= most] or [*instead, *beside]
+    if not choices:
+        return found
+    law = max(choices, key=lambda law: law.gain_db)
+    model = without_superfluous(bench, found.start, law.model, law.name)
+    return _with(found, Trial.of(law.name, model, found.final, bench.score(model)))
 
 
 def _trials(bench: Workbench, found: Found, without: Collection[str]) -> Iterator[Trial]:
     """Each law beside all names, and in place of those of its family; how much more it explains than all names."""
     for effect in EFFECTS:
-        if not effect.free or effect.name in {AHEAD, *without, *dict(found.model.effects)}:
+        if not effect.free or effect.name in {AHEAD, *without}:
             continue
         family = [
             step.name for step in found.steps if not find(step.name).free and find(step.name).family == effect.family
@@ -171,10 +169,6 @@ def _with(found: Found, law: Trial) -> Found:
     known_db, first = sum(step.gain_db for step in replaced), replaced[0].name
     reading = found.like.get(first, Reading(first, known_db / (known_db + law.gain_db)))
     return replace(outcome, like={**found.like, law.name: reading})
-
-
-def _given(effect: str, key: str) -> bool:
-    return any(p.given for p in find(effect).parameters if p.name == key)
 
 
 def _written(value: object) -> str:

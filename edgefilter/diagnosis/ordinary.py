@@ -52,20 +52,27 @@ class Ordinary:
         """Share of ordinary recordings in which any effect is as surprising as that one, which lowers the level by gain_db.
 
         Of independent effects (Sidak 1967), each of whose p-values is uniform up to the share of recordings in which its
-        fit helps at all; as they are not independent, they count as fewer. An effect that is not among them, one of the
-        user's own, is held against the one that explains most by chance.
+        fit helps at all; as they are not independent, they count as fewer.
         """
-        chances, explained = self.effects, explained_db(gain_db)
-        if explained <= LEAST_DB:
-            return 1.0
-        known = (chances[name],) if name in chances else chances.values()
-        own = max(chance.of(explained) for chance in known)
-        return 1.0 - prod(1.0 - min(own, chance.share) for chance in chances.values()) ** self.independent
+        own = self.of(name, gain_db)
+        others = prod(1.0 - min(own, chance.share) for chance in self.effects.values())
+        return own if own == 1.0 else 1.0 - others**self.independent
+
+    def of(self, name: str, gain_db: float) -> float:
+        """Share of ordinary recordings in which that effect does so; of one of the user's own, that which explains most by chance."""
+        explained, known = explained_db(gain_db), self.effects
+        chances = (known[name],) if name in known else known.values()
+        return 1.0 if explained <= LEAST_DB else max(chance.of(explained) for chance in chances)
 
 
 def p_value(name: str, gain_db: float) -> float:
     """`Ordinary.p_value` by the table that comes with the package."""
     return _table().p_value(name, gain_db)
+
+
+def own_p_value(name: str, gain_db: float) -> float:
+    """`Ordinary.of` by the table that comes with the package: of one effect that was not chosen from many."""
+    return _table().of(name, gain_db)
 
 
 def percent(p: float) -> str:

@@ -51,10 +51,12 @@ def _stepwise(bench: Workbench, start: EchoModel) -> Iterator[EchoModel]:
         newest = forward(bench, model)
         if newest is None:
             return
-        grown = split(bench, start, backward(bench, start, refit(bench, start, newest.model), newest.name))
-        if bench.score(grown).level_db >= bench.score(model).level_db:
+        before_db, grown = bench.score(model).level_db, refit(bench, start, newest.model)
+        simpler = split(bench, start, backward(bench, start, grown, newest.name))
+        lower = [each for each in (simpler, grown) if bench.score(each).level_db < before_db]
+        if not lower:
             return
-        model, enough_db = grown, bench.criteria.heard_db
+        model, enough_db = lower[0], bench.criteria.heard_db
         yield standing(bench, start, model)
 
 

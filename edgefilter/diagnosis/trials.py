@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from edgefilter.diagnosis.criteria import Criteria
-from edgefilter.diagnosis.ordinary import p_value
+from edgefilter.diagnosis.ordinary import own_p_value, p_value
 from edgefilter.diagnosis.straightened import Score, Straightened, share_of
 from edgefilter.echo.effect import vanishes
 from edgefilter.echo.effects.catalogue import EFFECTS, find, names
@@ -244,10 +244,7 @@ class Workbench:
 
     def filtered_ahead(self, model: EchoModel) -> EchoModel | None:
         """The model with its filters of the echo path replaced by one filter ahead of the loudspeaker; None if it has none on the path."""
-        others = model
-        for name in added(self._start, model):
-            if _on_path(name):
-                others = self.less(others, name)
+        others = reduce(self.less, filter(_on_path, added(self._start, model)), model)
         ahead = None if others is model else self.attempt(AHEAD, others)
         return ahead.model if ahead else None
 
@@ -305,7 +302,7 @@ class Workbench:
 
     def _outdoes(self, one: Trial, other: Trial) -> bool:
         """Whether one explains more than another, by more than chance; a flexible one by more than it takes up of whatever is left."""
-        by_chance = p_value(one.name, one.gain_db - other.gain_db) > self.criteria.false_rate
+        by_chance = own_p_value(one.name, one.gain_db - other.gain_db) > self.criteria.false_rate
         taken_up = find(one.name).flexible and other.gain_db >= self.criteria.nearly * one.gain_db
         return not (by_chance or taken_up)
 

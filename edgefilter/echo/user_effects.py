@@ -23,7 +23,7 @@ from edgefilter.types import SAMPLE_RATE
 
 REQUIRED = ("name", "stage", "parameters", "fit")
 """What no effect can do without; the rest has the defaults of Effect."""
-HOOKS = {name for kind in (Effect, Shift) for name, value in vars(kind).items() if callable(value) and name[0] != "_"}
+HOOKS = [name for name, hook in {**vars(Effect), **vars(Shift)}.items() if callable(hook) and not name.startswith("_")]
 PROBE_SAMPLES = 4000
 """Of noise, on which neutral values must change nothing: a quarter of a second."""
 _loaded: dict[Path, str] = {}

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from edgefilter.diagnosis import select
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.diagnose import conclude, holds
 from edgefilter.diagnosis.prepare import prepare
@@ -296,3 +297,11 @@ def test_half_of_the_power_over_the_fan_is_gone_from_6_dB_at_3_96(active_db, hal
     bench, model = Workbench(found, Criteria()), EchoModel(path())
     bench.score = lambda asked: verdict(6.0)
     assert bench.halves(Trial("late_reverb", {}, model, verdict(active_db), 0.5), model) is halved
+
+
+def test_a_step_of_the_search_is_not_lost_where_what_is_simpler_explains_less(monkeypatch: pytest.MonkeyPatch) -> None:
+    x = voice(4.0)
+    prepared = prepare(profile(), record(np.float32(0.7) * x), x)
+    monkeypatch.setattr(select, "backward", lambda bench, start, model, newest: start)
+    found = search(prepared, prepared.model, Criteria())
+    assert [step.name for step in found.steps] == ["playback_gain"]

@@ -259,3 +259,20 @@ def test_an_equaliser_ahead_of_what_bends_the_voice_is_told_from_one_behind() ->
     assert found.ranking[0].effect == "free_filter_ahead" and found.ranking[0].like.share > 0.9
     assert "a filter of 8 ms" in found.ranking[0].evidence
     assert found.comparison.excess_db > 20.0 and found.remaining_db < 1.0  # with the equaliser behind: 15
+
+
+def test_what_a_name_is_of_a_law_counts_after_what_the_law_made_superfluous_is_dropped() -> None:
+    found = searched("dynamics ahead")
+    named = found.with_only(
+        {
+            "playback_gain": {"gain_db": -1.0},
+            "compression": found.recording.fitted(
+                "compression", found.model.with_effect("playback_gain", {"gain_db": -1.0})
+            ),
+        }
+    )
+    better = with_laws(named, Criteria())
+    assert [step.name for step in better.steps] == ["free_gain"]
+    name, share = better.like["free_gain"]
+    known_db = next(step.gain_db for step in named.steps if step.name == name)
+    assert share == pytest.approx(known_db / (known_db + named.final.level_db - better.final.level_db), abs=1e-9)

@@ -7,8 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.select import _in_steps
-from edgefilter.diagnosis.trials import less
+from edgefilter.diagnosis.trials import Workbench, less
 from edgefilter.echo.model import EchoModel
 
 START = EchoModel(np.eye(1, 8, dtype=np.float32)[0])
@@ -50,3 +51,13 @@ def test_what_a_bent_amplifier_raises_is_not_the_volumes(bent_db: float, anew: d
     steps = _in_steps(bench, START, BOTH)  # type: ignore[arg-type]  # as much of a Workbench as is asked
     assert [step.name for step in steps] == [first, BENT if first is GAIN else GAIN]
     assert steps[-1].score.excess_db == 0.5
+
+
+def test_one_effect_outdoes_another_by_its_own_chance_and_not_by_that_of_all() -> None:
+    # a hard clip ahead of the loudspeaker: the limiter leaves 2.0 dB, the loudspeaker's curve 0.7
+    clipped = [SimpleNamespace(name="limiter", gain_db=0.48), SimpleNamespace(name=BENT, gain_db=0.83)]
+    bench = SimpleNamespace(criteria=Criteria())
+    bench._outdoes = lambda one, other: Workbench._outdoes(bench, one, other)
+    assert Workbench.preferred(bench, clipped).name == BENT
+    clipped[1].gain_db = 0.55  # more by what ordinary recordings show
+    assert Workbench.preferred(bench, clipped).name == "limiter"

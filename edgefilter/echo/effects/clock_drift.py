@@ -7,12 +7,10 @@ import scipy
 
 from edgefilter.dsp.fractional_delay import interpolate
 from edgefilter.echo.effect import Parameter, Shift, first, neutral, within
-from edgefilter.echo.lag_track import lags_of, track_lag
+from edgefilter.echo.lag_track import BLOCK, REACH, lags_of, track_lag
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import Array
 
-LONG, NEAR = 8000, 16
-"""Samples of a block and of lag either way once the drift is taken out, which smears blocks as long."""
 STEADY = 0.05
 """Samples by which a block's lag may err for other reasons than noise."""
 LEAST = 0.5
@@ -45,22 +43,18 @@ class ClockDrift(Shift):
         return n - float(values["offset"]) + 1e-6 * float(values["ppm"]) * n
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """A robust line through the lags of all blocks, then once more on the prediction that it has straightened; neutral for one clock."""
+        """A robust line through the lags of all blocks, then in longer ones, which a drift smears, of what that has straightened."""
         track, n = measurement.once(lags_of, model), np.arange(measurement.recording.size)
-        lag: Array = np.zeros(n.size)
-        for last in (False, True):
-            if track.lag.size < 3:
-                break
-            slope, offset = robust_line(track.middle, track.lag + np.interp(track.middle, n, lag), track.sigma)
-            lag = offset + slope * n
-            if last or max(1e6 * abs(slope), abs(offset)) < LEAST:
-                break
-            straight = measurement.whiten(interpolate(measurement.predicted(model)[0], n - lag))
-            track = track_lag(straight, measurement.white_recording, measurement.fit, LONG, NEAR)
-        if not n.size:
+        if track.lag.size < 3:
             return neutral(self)
-        ppm = -1e6 * (lag[-1] - lag[0]) / max(n.size - 1, 1)
-        return within(self, {"ppm": ppm, "offset": lag[0]}) if max(abs(ppm), abs(lag[0])) >= LEAST else neutral(self)
+        slope, offset = robust_line(track.middle, track.lag, track.sigma)
+        if max(1e6 * abs(slope), abs(offset)) < LEAST:
+            return neutral(self)
+        straight = measurement.whiten(interpolate(measurement.predicted(model)[0], n - offset - slope * n))
+        track = track_lag(straight, measurement.white_recording, measurement.fit, 2 * BLOCK, REACH)
+        if track.lag.size >= 3:
+            slope, offset = robust_line(track.middle, track.lag + offset + slope * track.middle, track.sigma)
+        return within(self, {"ppm": -1e6 * slope, "offset": offset})
 
     def sentence(self, values: Values) -> str:
         return f"the lag grows along a line, by {abs(first(values, 'ppm')):.1f} samples in a million"
