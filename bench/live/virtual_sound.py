@@ -1,4 +1,4 @@
-"""A private PulseAudio or PipeWire with null sinks, seen by PortAudio through ALSA by their and their monitors' names."""
+"""A private PulseAudio or PipeWire server with null sinks. PortAudio sees each sink and its monitor through ALSA, under their names."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SYSTEMS = ("pulseaudio", "pipewire")
 
 @dataclass
 class Server:
-    """A running server, with all that it consists of, and the environment that leads to it."""
+    """A running sound server: its processes, and the environment variables with which programs reach it."""
 
     process: subprocess.Popen
     environment: dict
@@ -31,9 +31,9 @@ class Server:
 
 
 def start_server(folder: Path, sinks: Sequence[str] = SINKS, system: str = SYSTEMS[0], channels: int = 1) -> Server:
-    """Start a server whose files all lie in folder and wait until its devices are there.
+    """Start a sound server that keeps all its files in folder, and wait until its devices are there.
 
-    The first sink is the default output, the last one's monitor the default microphone. channels: of the sinks.
+    The first sink is the default output, the last one's monitor the default microphone. channels: of each sink.
     """
     pulse = system == "pulseaudio"
     socket = f"unix:{folder}/{'socket' if pulse else 'pulse/native'}"

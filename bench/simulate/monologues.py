@@ -18,7 +18,7 @@ PAUSE_S = (0.4, 2.0)
 END_S = 3.0
 """Silence at the end: the echo of the last utterance dies away in it."""
 FAN_DB = -31.5
-"""Power of the fan, against the robot's (between lab and office of `conversations`)."""
+"""Power of the fan's noise over that of the robot's voice at the microphone, dB: between those of `conversations` in lab and office."""
 ROOMS = ("lab", "office")
 STARTS, LAG_S, PPM = ("calibrated", "cold"), (0.02, 1.0), (10.0, 300.0)
 TRIAL_S = 6.0
@@ -26,7 +26,7 @@ TRIAL_S = 6.0
 
 
 class Repertoire(Iterator[Array]):
-    """What the robot says: clips one after the other, each with a peak of 0.7; said: those so far, with their seconds."""
+    """The clips that the robot says, one after the other, each scaled to a peak of 0.7; `said` lists those taken, with their seconds."""
 
     def __init__(self, clips: Iterable[Clip]) -> None:
         self._clips = iter(clips)
@@ -43,7 +43,7 @@ def speak(
     rng: Rng, robot: Robot, repertoire: Iterator[Array], speech_s: float, room: Room, lag: int, volume_db: float = 0.0,
     ppm: float = 0.0,
 ) -> tuple[Array, Array, list[slice]]:  # fmt: skip
-    """Reference (n,), echo (n,) without gain, and where in the echo each utterance is, of so many seconds of speech."""
+    """Make speech_s seconds of speech: the reference (n,), its echo (n,) before the microphone's gain, and where in the echo each utterance lies."""
     said: list[tuple[int, Array]] = []
     at, missing = RATE // 2, speech_s * RATE
     while missing > 0:
@@ -65,8 +65,9 @@ def speak(
 class Monologue:
     """One robot in one room, from the filter's first moment on.
 
-    ref, mic: (n,) float32. echo: of mic, what the robot says; late: samples by which it is later than in ref. start: whether
-    the filter has the calibration (sweep, its recording, the fan). said: clips in order, and how many seconds each.
+    ref, mic: reference and microphone, (n,) float32. echo: the robot's part of mic. late: samples by which the echo comes
+    after the reference. start: "calibrated" where the filter gets the calibration (sweep, its recording, the fan's noise),
+    "cold" where it does not. said: the clips in order, with their durations in seconds.
     """
 
     ref: Samples
@@ -82,9 +83,11 @@ class Monologue:
 
 
 def make_monologue(seed: int, index: int, voice: str, clips: Iterator[Clip], speech_s: float) -> Monologue:
-    """Number index of this seed: rooms, distortions, starts in turn; clocks that differ in every other eight.
+    """Simulate monologue number `index` of this seed.
 
-    The gain is one at which a sweep in that room has a peak of 0.3 of full scale, or the voice one of 0.8.
+    The index decides kind of room, distortion and start, each in turn, and whether the clocks differ, for eight monologues
+    yes and for eight no. The microphone's gain is the largest at which neither a sweep in that room has a peak above 0.3 of
+    full scale nor the voice one above 0.8.
     """
     rng = np.random.default_rng([seed, index])
     kind, distortion, start = ROOMS[index % 2], tuple(DISTORTION_DB)[index // 2 % 2], STARTS[index // 4 % 2]

@@ -385,7 +385,7 @@ class Aligner:
         self._resolve()
         if not self._known or abs(found.lag - self._drift.delay) > SAME:
             return self._switch(float(found.lag))
-        if self._gain is None:  # found again, though no measurement has seen it: a broad arrival has no peak
+        if self._gain is None:  # searches agree on the lag, but no measurement sees a peak: the arrival is broad
             self._meter = self._new_meter()
             drift, now = self._drift, self._ref.end
             self._meter.study(self._mics[self._used[0]], self._ref, now - WINDOW, now, drift.delay, drift.slope)
@@ -473,7 +473,7 @@ class Aligner:
         if self._gain is not None and self._lost >= LOST_BLOCKS:
             self._lost = 0
             self._open.append(Utterance(self._ref.end, self._ref.end, nearby=NEARBY_SEARCHES, lost=True))
-        elif self._gain is None and self._log_odds < 0.0:  # never confirmed: it may be wrong from the start
+        elif self._gain is None and self._log_odds < 0.0:  # no measurement ever confirmed this lag
             self._open.append(Utterance(self._onsets.current.start, self._onsets.current.end, lost=True))
 
     def _deliver(self, mic: Samples, before: float, switched: bool) -> Aligned:

@@ -172,7 +172,7 @@ class DelayMeter:
         self._confirmed = offset
 
     def study(self, mic: DelayBuffer, ref: DelayBuffer, start: int, now: int, delay: float, slope: float) -> None:
-        """Learn the response from the sound from start to now, in which this delay was found; the next measurement uses other sound."""
+        """Learn the response from samples start to now, in which a search found this delay. Later measurements of other samples can refute it."""
         for end in range(start + FRAME, now - FRAME + 1, STRIDE):
             if self.measure(mic, ref, end, delay, slope, far=False):
                 self.confirm(0.0)
@@ -205,7 +205,7 @@ class DelayMeter:
 
 
 def _highest(likelihood: Samples, reach: int) -> tuple[int, float, float]:
-    """Index of the highest peak at most reach from the middle, and its strength and ratio among the lags there."""
+    """Index of the highest peak at most `reach` lags from the middle, and its strength and ratio (see DelayMeasurement) among these lags."""
     first = likelihood.size // 2 - reach
     inner = likelihood[first : first + 2 * reach]
     at = int(inner.argmax())

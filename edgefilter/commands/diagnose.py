@@ -96,11 +96,11 @@ def _apply(
     step: Callable[[str], None],
     array: ArrayCalibration | None,
 ) -> tuple[Fitted, None] | tuple[None, EdgefilterError | None]:
-    """Write the profile with all effects that were found: what was fitted, and the error that kept it from being written.
+    """Write the profile with all effects that were found; return the fit, and the error that prevented writing.
 
-    One of the two is None, and both where nothing was found: the diagnosis is printed in any case. A profile made from the
-    recording, whose path is a quarter of a second, gets the whole length of the room's response. array: the other
-    microphones, which get the same effects on their own paths.
+    One of the two is None, or both where nothing was found. The error is returned, not raised, so that the diagnosis is printed in
+    any case. A profile made from the recording has an impulse response of a quarter of a second; it is lengthened to the
+    room's. array: calibration of the other microphones, which get the same effects on their own paths.
     """
     step("fit of what was found, and proof in the running filter")
     names = [finding.effect for finding in in_order(found.ranking)]

@@ -122,11 +122,11 @@ def with_laws(
     progress: Callable[[str], None] | None = None,
     without: Collection[str] = (),
 ) -> Found:
-    """What a search has found, with the law without which it leaves much of the recording.
+    """Add a free law, a fitted curve or response instead of an effect with a name, where the effects that a search has found leave much unexplained.
 
-    A law beside all names has to be there by more than chance; one in place of the names of its family, which is known
-    to be there, has to predict more than they do. It is preferred only where it explains much more. What the law makes
-    superfluous is dropped. None is looked for where the names leave as little as those of right ones do.
+    A law in addition to these effects has to explain more than chance would. One that replaces the effects of its own family, which
+    is known to act, has to predict held-out samples better than they do, and is preferred only where it explains much more.
+    Effects that the law makes superfluous are dropped. No law is tried where the effects leave as little as right ones do.
     """
     bench = Workbench(found.recording, criteria, progress, without, found.start)
     left = max(found.final.over_db - found.final.floor_db, 0.0)

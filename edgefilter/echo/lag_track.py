@@ -13,7 +13,7 @@ from edgefilter.echo.measurement import Measurement, VoiceModel
 from edgefilter.types import Array, Samples
 
 BLOCK, REACH = 4000, 2400
-"""Samples of a block and of lag either way: a quarter of a second tells a lag, and 150 ms are the longest jump that is found."""
+"""BLOCK: samples of which one lag is estimated, a quarter of a second. REACH: the longest lag of either sign, samples, 150 ms."""
 LEAST_CORRELATION = 0.3
 """Blocks whose normalised correlation at the best lag is below this say nothing about the lag."""
 

@@ -43,7 +43,7 @@ class ClockDrift(Shift):
         return n - float(values["offset"]) + 1e-6 * float(values["ppm"]) * n
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """A robust line through the lags of all blocks, then in longer ones, which a drift smears, of what that has straightened."""
+        """Fit a robust line to the lags of all blocks, take out its drift, and fit again to longer blocks, which the drift would have smeared."""
         track, n = measurement.once(lags_of, model), np.arange(measurement.recording.size)
         if track.lag.size < 3:
             return neutral(self)

@@ -30,9 +30,9 @@ class EarlyPath(AddedResponse):
     )
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """What fit_path() finds, which late_reverb shares.
+        """Take the change of the impulse response that fit_path() finds, which is computed once for this effect and late_reverb.
 
-        Neutral where none of it holds on other samples, or where the room sounds longer.
+        The values are neutral where the change does not lower the error on held-out samples, or where the room reverberates longer.
         """
         added, _, longer = measurement.once(fit_path, model)
         grown = np.cumsum(added**2)

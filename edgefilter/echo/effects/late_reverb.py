@@ -22,9 +22,10 @@ BLOCK = 320
 DIRECT = 48
 """Samples up to which no reflection of a room comes: a detour of a metre. A change there is another effect's."""
 LATE, LOUDER_DB, LEFT = 1280, 7.5, 1e-4
-"""Samples (80 ms, as of the clarity C80 of ISO 3382-1) behind which a longer room has more of its energy, by so many dB: by 9 or more
-in 26 rooms that three reverberators made longer, by 5 at most in 16 of 17 in which robot or microphone had moved. Echoes reach 9,
-and make the centre time earlier. The last LEFT of the energy is noise."""
+"""LATE: samples, 80 ms as in the clarity C80 of ISO 3382-1, after which the energy of a response is late. LOUDER_DB: by how much its share of
+all energy rises at least where a room reverberates longer: by 9 dB or more in 26 rooms to which one of three artificial
+reverberators was added, by 5 at most in 16 of 17 in which robot or microphone had moved. Single echoes raise it by up to 9, but make
+the centre time earlier. LEFT: share of the energy that counts as noise."""
 
 
 ADDED = Parameter("added", "1", 0.0, -1e3, 1e3), Parameter("taps", "1", 0.0, -10.0, 10.0, given=True)
@@ -140,7 +141,7 @@ def centre_time(response: Array) -> float:
 
 
 def late_db(response: Array) -> float:
-    """Level of what comes LATE in a response (k,) from lag 0, re all of it, from that of LEFT up."""
+    """Share of the energy of a response (k,), whose first sample has lag 0, that comes after LATE samples, dB; at least LEFT."""
     energy = response**2
     return float(decibels(max(energy[LATE:].sum() / max(energy.sum(), 1e-30), LEFT)))
 
