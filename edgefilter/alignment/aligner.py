@@ -145,10 +145,8 @@ class Aligner:
         self._coarse = False  # whether a lag is followed at which nothing sharp arrives
         self._margin = PRE_ROLL
         self._known = self._refuted = self._measured = False
-        self._log_odds, self._lost = (
-            0.0,
-            0,
-        )  # of the delay; below 0 also where none is known and an utterance was not heard
+        self._log_odds = 0.0  # of the delay; below 0 also where none is known and an utterance was not heard
+        self._lost = 0  # measurements in a row that have not seen the robot
         self._counts = AlignmentCounts(
             utterances=0, realignments=0, jumps=0, searches=0, announced=0, announced_heard=0
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy import signal
 
 from edgefilter.dsp.stft import StftConfig
@@ -10,12 +11,30 @@ from edgefilter.echo.effect import complete
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.running import SourceChain, VoiceChain
 from edgefilter.filter.canceller import Canceller
-from edgefilter.filter.residual_echo import Residual
+from edgefilter.filter.residual_echo import Residual, Unpredictable
 from edgefilter.session import level_db as db
 from tests.conformance import robot_model, robot_speech, running_robot
 from tests.filter.canceller_scene import path, run, speechlike
 
 STFT = StftConfig()
+
+
+def test_expected_squares_become_the_power_that_such_noise_has_in_a_frame() -> None:
+    rng = np.random.default_rng(1)
+    square = np.repeat([0.0, 4.0, 1.0, 0.25], 128).astype(np.float32)
+    low = np.where(np.arange(601) < 150, 1 / 2000, 0.0)  # 0 to 2 kHz
+    white = np.sqrt(square) * rng.standard_normal((4000, 512))
+    heard = np.mean(np.abs(np.fft.rfft(white * STFT.analysis_window)) ** 2, axis=0)
+    expected = Unpredictable(STFT, [np.full(601, 1 / 8000), low])
+    for part in (square[:256], square[256:]):
+        found = expected.step([part, np.zeros(256, np.float32)])
+    np.testing.assert_allclose(
+        found, heard, rtol=0.15
+    )  # the mean of 4000 frames is known to 1.6 %, at either end to 2.2
+    coloured = Unpredictable(STFT, [low])
+    for part in (square[:256], square[256:]):
+        found = coloured.step([part])
+    assert found[:60] == pytest.approx(4 * np.mean(heard[1:-1]), rel=0.05) and not found[70:].any()
 
 
 def test_what_no_waveform_predicts_is_expected_to_be_left_and_not_learnt_as_leakage() -> None:

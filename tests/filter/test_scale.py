@@ -37,7 +37,7 @@ def test_neither_the_level_of_the_reference_nor_that_of_the_microphone_changes_t
 
     usual, noticed = answered(1.0, 1.0)
     assert bool(noticed) is (engine == "crnn")
-    for heard, played in ((0.01, 100.0), (30.0, 0.01)):
+    for heard, played in ((0.01, 1.0), (0.01, 100.0), (100.0, 0.01), (1.0, 100.0)):
         found, times = answered(heard, played)
         assert found == pytest.approx(usual, abs=SAME_DB), (heard, played)
         assert times == pytest.approx(noticed, abs=1600), (heard, played)  # a tenth of a second
