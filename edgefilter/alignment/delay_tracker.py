@@ -147,7 +147,7 @@ class DelayMeter:
         correlation = fourier.irfft(np.array(products), SIZE)
         likelihood = np.concatenate((correlation[:, -REACH:], correlation[:, :REACH]), axis=1).ravel()
         overlap = np.concatenate([_overlap(reference) for reference in references])
-        likelihood /= np.sqrt(overlap + 0.1 * overlap.max())
+        likelihood /= np.sqrt(overlap + 0.1 * overlap.max() + 1e-30)  # an offset has no difference
         expected = likelihood.size // 2
         at, strength, ratio = max(
             (_highest(likelihood, reach) for reach in {REACH, expected}), key=lambda found: found[1] * found[2]
