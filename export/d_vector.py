@@ -13,9 +13,11 @@ from pathlib import Path
 
 import numpy as np
 import onnxruntime
+from scipy import signal
 
 from edgefilter.errors import UsageError
-from edgefilter.types import SAMPLE_RATE, Array, Samples
+from edgefilter.types import Array, Samples
+from export.mel import mel_filters
 
 SIZE = 256
 """Values of a d-vector."""
@@ -51,35 +53,9 @@ def log_mel(samples: Samples) -> Array:
     """Decimal logarithm of the power in each mel band, (frames, BANDS) float32, of whole windows of samples (n,)."""
     padded = np.pad(samples, (0, max(N_FFT - samples.size, 0)))
     frames = np.lib.stride_tricks.sliding_window_view(padded, N_FFT)[::HOP]
-    window = np.zeros(N_FFT)
-    side = (N_FFT - WINDOW) // 2
-    window[side : side + WINDOW] = 0.54 - 0.46 * np.cos(2 * np.pi * np.arange(WINDOW) / WINDOW)
+    window = np.pad(signal.get_window("hamming", WINDOW), (N_FFT - WINDOW) // 2)
     power = np.abs(np.fft.rfft(frames * window)) ** 2
-    return np.log10(power @ _bands().T + FLOOR).astype(np.float32)
-
-
-@lru_cache(maxsize=1)
-def _bands() -> Array:
-    """Triangles of equal area, evenly spaced on Slaney's mel scale (Slaney 1998, "Auditory Toolbox"), (BANDS, bins)."""
-    edges = _hz(np.linspace(0.0, _mel(SAMPLE_RATE / 2), BANDS + 2))
-    low, centre, high = edges[:-2, None], edges[1:-1, None], edges[2:, None]
-    bins = np.arange(N_FFT // 2 + 1) * SAMPLE_RATE / N_FFT
-    triangles = np.minimum((bins - low) / (centre - low), (high - bins) / (high - centre))
-    return np.maximum(triangles, 0.0) * 2 / (high - low)
-
-
-STEP_HZ, KNEE_HZ, LOG_STEP = 200 / 3, 1000.0, np.log(6.4) / 27
-"""Slaney's scale: so many Hz a mel up to the knee, then 27 mel to 6.4 times the frequency."""
-
-
-def _mel(hz: float) -> float:
-    """Above the knee only."""
-    return KNEE_HZ / STEP_HZ + np.log(hz / KNEE_HZ) / LOG_STEP
-
-
-def _hz(mel: Array) -> Array:
-    knee = KNEE_HZ / STEP_HZ
-    return np.where(mel < knee, mel * STEP_HZ, KNEE_HZ * np.exp(LOG_STEP * (mel - knee)))
+    return np.log10(power @ mel_filters(BANDS, N_FFT).T + FLOOR).astype(np.float32)
 
 
 def find() -> Path:

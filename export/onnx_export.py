@@ -3,10 +3,10 @@
 python -m export.onnx_export CHECKPOINT --output models/crnn.onnx [--int8] [--platt SCALE BIAS] [--figures FIGURES.json]
 
 A checkpoint is what torch.save made of a dict: network (a state_dict), config (the fields of its configuration),
-figures (what it reached on validation data) and kind ("edge", also where it is missing, or "paper"); all else in it
-says how it was trained, and goes into the file's metadata like the figures; of the paper's network, which there is in
-several widths, its sizes go there as well. The file is written only once the ONNX
-checker, the parity test and the size limit have passed; otherwise ModelError says which failed.
+figures (what it reached on validation data) and kind ("edge", also where it is missing, "paper", or "voicefilter", of which
+export/voicefilter.py writes the file); all else in it says how it was trained, and goes into the file's metadata like the
+figures; of the paper's network, which there is in several widths, its sizes go there as well. The file is written only once
+the ONNX checker, the parity test and the size limit have passed; otherwise ModelError says which failed.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ from export import onnx_parity
 from export.edge_graph import EdgeGraph
 from export.network import EdgeConfig, EdgeCrnn
 from export.paper_network import PaperConfig, PaperCrnn, parameter_count
+from export.voicefilter_network import VoiceFilter, VoiceFilterConfig
 
 OPSET = 17
 MAX_EDGE_BYTES = 12_000_000
@@ -58,9 +59,11 @@ def load(path: Path) -> Trained:
     """The network that a checkpoint holds; raises ModelError where it holds none."""
     try:
         found = torch.load(path, map_location="cpu", weights_only=True)
-        make = {"edge": lambda c: EdgeCrnn(EdgeConfig(**c)), "paper": lambda c: PaperCrnn(PaperConfig(**c))}[
-            found.get("kind", "edge")
-        ]
+        make = {
+            "edge": lambda c: EdgeCrnn(EdgeConfig(**c)),
+            "paper": lambda c: PaperCrnn(PaperConfig(**c)),
+            "voicefilter": lambda c: VoiceFilter(VoiceFilterConfig(**c)),
+        }[found.get("kind", "edge")]
         network = make(found["config"])
         network.load_state_dict(found["network"])
     except OSError as error:
@@ -99,18 +102,25 @@ def export(trained: Trained, path: Path, int8: bool = False) -> list[str]:
     write, compare = (
         (_write_paper, onnx_parity.paper) if isinstance(trained.network, PaperCrnn) else (_write_edge, onnx_parity.edge)
     )
-    unproven = path.with_name(f".{path.name}.unproven")
-    try:
+    with in_place_of(path) as unproven:
         write(trained, unproven)
         apart = compare(trained.network, unproven)
         _check_size(trained.network, unproven)
-        os.replace(unproven, path)
-    finally:
-        unproven.unlink(missing_ok=True)
     lines = [f"{path}: {path.stat().st_size / 1e6:.2f} MB, {apart:.1e} from torch at most"]
     if int8:
         lines.append(_write_int8(trained, path))
     return lines
+
+
+@contextmanager
+def in_place_of(path: Path) -> Iterator[Path]:
+    """A file to write, which takes the path's place where nothing fails, and is gone otherwise."""
+    unproven = path.with_name(f".{path.name}.unproven")
+    try:
+        yield unproven
+        os.replace(unproven, path)
+    finally:
+        unproven.unlink(missing_ok=True)
 
 
 def _write_edge(trained: Trained, path: Path, products: bool = False) -> None:

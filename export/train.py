@@ -33,7 +33,7 @@ from export.losses import LossWeights
 from export.network import EdgeConfig
 from export.onnx_export import load
 from export.paper_network import PaperCrnn
-from export.step_times import measure, table
+from export.step_times import table
 from export.tasks import TASKS, EdgeTask, PaperTask
 from export.trainer import Plan, Trainer
 
@@ -143,7 +143,7 @@ def main(argv: list[str] | None = None) -> int:
         before = sizes_before(options.network, options.output / "last.pt", options.start)
         task = TASKS[options.network](options, before)
         if options.times:
-            print(table(measure(task, Batches(Items(options.data), task.stft, shape, options.seed))))
+            print(table(task, Batches(Items(options.data), task.stft, shape, options.seed)))
             return 0
         options.output.mkdir(parents=True, exist_ok=True)
         trainer = Trainer(task, plan, shape, options.output, options.start)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -91,14 +91,14 @@ class Trainer:
 
     def train(self, items: Items, held_out: Items) -> Path:
         """Train on these, wherever they come from."""
-        batches = Batches(items, self.task.stft, self.shape, self.plan.seed, self.processes.rank)
+        draw = self._draws(items)
         print(f"{self.task.describe(self.network)}; {len(items.names)} items, from step {self.step}", flush=True)
         steps = range(self.step, self.plan.steps)
         board = SummaryWriter(self.output) if self.processes.rank == 0 else None
         with tqdm(steps, initial=self.step, total=self.plan.steps, disable=board is None) as progress:
             began = time.perf_counter() - self.seconds
             for step in progress:
-                shown = self._one(step, batches.draw(step))
+                shown = self._one(step, draw(step))
                 progress.set_postfix(loss=f"{shown['total']:.4f}", si_sdr=f"{-shown['si_sdr']:.1f}")
                 self.step, self.seconds = step + 1, time.perf_counter() - began
                 over = self.processes.agree(self.plan.done_at(self.step, self.seconds) >= 1.0, self._device())
@@ -112,6 +112,14 @@ class Trainer:
         if board:
             board.close()
         return self.output / "best.pt"
+
+    def _draws(self, items: Items) -> Callable[[int], dict[str, Tensor]]:
+        """What gives the batch of a step."""
+        return Batches(items, self.task.stft, self.shape, self.plan.seed, self.processes.rank).draw
+
+    def _figures(self, network: nn.Module, held_out: Items) -> dict[str, float]:
+        """What a network reaches on held-out items, "total" being the loss."""
+        return validate(self.task, network, held_out, HELD_OUT_S)
 
     def _one(self, step: int, batch: Mapping[str, Tensor]) -> dict[str, float]:
         """One step; returns the loss terms."""
@@ -137,7 +145,7 @@ class Trainer:
         """Validate the averaged weights and write what training goes on from, and the weights where they are the best."""
         averaged = self.task.network().to(self._device())
         averaged.load_state_dict(self.average)
-        figures = validate(self.task, averaged, held_out, HELD_OUT_S)
+        figures = self._figures(averaged, held_out)
         score = -figures["total"]
         self.since = 0 if score > self.best else self.since + 1
         said = in_stages(self.before, self.step, self.plan.seed, len(items.names))

@@ -21,13 +21,14 @@ import torch
 
 from edgefilter.errors import EdgefilterError
 from export.corpus import read_corpus
+from export.crops import Shape
 from export.d_vector import d_vector
-from export.paper_network import parameter_count
+from export.onnx_export import load
 from export.trainer import Plan
 from export.voicefilter_mixtures import Mixtures, Voices, read_items
 from export.voicefilter_network import VoiceFilterConfig
 from export.voicefilter_onnx import export, rounded
-from export.voicefilter_trainer import VoiceFilterTrainer, load, validate
+from export.voicefilter_trainer import VoiceFilterTask, VoiceFilterTrainer, validate
 
 CACHE = "d_vectors.npz"
 
@@ -67,18 +68,15 @@ def train(options: argparse.Namespace) -> list[str]:
     options.output.mkdir(parents=True, exist_ok=True)
     config = VoiceFilterConfig(channels=options.channels, hidden=options.hidden)
     plan = Plan(options.steps, options.rate, options.seed, options.every, minutes=options.minutes)
-    trainer = VoiceFilterTrainer(config, plan, options.output, not options.full_precision)
+    task, shape = VoiceFilterTask(config, not options.full_precision), Shape(options.batch, options.seconds, 0)
     data = mixtures(options.data, options.speech, config, options.seed, options.output / CACHE)
     held_out = mixtures(
         options.validation, options.validation_speech, config, 0, options.output / f"validation_{CACHE}"
     )
-    print(
-        f"{parameter_count(trainer.network)} parameters; {len(data.items)} items, {len(data.told)} with a human who is told",
-        flush=True,
-    )
-    trainer.run(data, held_out, options.batch, options.seconds)
+    print(f"{len(data.told)} of {len(data.items)} items have a human who is told", flush=True)
+    VoiceFilterTrainer(task, plan, shape, options.output).train(data, held_out)
     best = rounded(load(options.output / "best.pt"))
-    best = replace(best, figures=validate(best.network, held_out))
+    best = replace(best, figures=validate(task, best.network, held_out))
     best.network.eval()
     return [str(best.figures), export(best, options.output / "voicefilter.onnx")]
 

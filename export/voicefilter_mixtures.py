@@ -89,10 +89,11 @@ def read_items(folder: Path) -> list[Item]:
 
 
 class Mixtures:
-    """Batches from items; that of a step depends on seed, step and the items alone."""
+    """Batches from items; that of a step depends on seed, step and the items alone. names: of the items."""
 
     def __init__(self, items: Sequence[Item], voices: Voices, stft: StftConfig, seed: int) -> None:
         self.items, self.voices, self.stft, self.seed = items, voices, stft, seed
+        self.names = [item.name for item in items]
         self.told = [item for item in items if voices.others(item.speaker, item.recordings)]
         if not self.told:
             raise UsageError(
@@ -107,6 +108,10 @@ class Mixtures:
         samples = int(seconds * SAMPLE_RATE) // self.stft.hop * self.stft.hop
         rows = [self._crop(rng, samples) for _ in range(batch)]
         return self.spectra(*(np.stack(each) for each in zip(*rows, strict=True)))
+
+    def refresh(self) -> int:
+        """How many items there are; none is added to those that were read."""
+        return len(self.items)
 
     def whole(self, item: Item, seconds: float, teller: Item | None = None) -> dict[str, Tensor]:
         """The last seconds of an item, as they are, with the first d-vector that can be had of its human, or of teller's."""

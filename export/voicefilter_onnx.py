@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from onnx import helper, numpy_helper
 from torch import nn
 
 from edgefilter.errors import ModelError
-from export.onnx_export import Trained, describe, trace
+from export.onnx_export import Trained, describe, in_place_of, trace
 
 TYPE, VERSION = "edgefilter-voicefilter", 1
 """What the file's metadata says; who loads it checks that."""
@@ -39,8 +38,7 @@ def export(trained: Trained, path: Path) -> str:
     Raises ModelError, and leaves path as it is, where the file differs from the network by more than TOLERANCE.
     """
     network = trained.network
-    unproven = path.with_name(f".{path.name}.unproven")
-    try:
+    with in_place_of(path) as unproven:
         bins, values = network.config.stft.bins, network.config.d_vector
         inputs = [torch.rand(1, 50, bins), torch.randn(1, values)]
         frames = {name: {1: "frames"} for name in ("magnitude", "mask")}
@@ -52,9 +50,6 @@ def export(trained: Trained, path: Path) -> str:
             raise ModelError(
                 f"{path.name} differs from torch by {apart:.1e}, expected at most {TOLERANCE}: not written"
             )
-        os.replace(unproven, path)
-    finally:
-        unproven.unlink(missing_ok=True)
     return f"{path}: {path.stat().st_size / 1e6:.2f} MB, {apart:.1e} from torch at most"
 
 

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn.functional import conv1d, gelu, layer_norm, linear, scaled_dot_product_attention
 
 from edgefilter.errors import EdgefilterError, ModelError
-from edgefilter.types import SAMPLE_RATE
+from export.mel import mel_filters
 
 N_FFT, HOP = 400, 160
 """Of Whisper's spectra, 25 and 10 ms (Radford et al. 2022, section 2.2)."""
@@ -75,7 +75,7 @@ class WhisperEncoder(nn.Module):
         for name, array in weights.items():
             if array.dtype in (np.float16, np.float32):
                 self.register_buffer(name.replace("/", "_"), torch.from_numpy(array.astype(np.float32)))
-        self.register_buffer("mel", torch.from_numpy(mel_filters(self.conv1_weight.shape[1])))
+        self.register_buffer("mel", torch.from_numpy(mel_filters(self.conv1_weight.shape[1], N_FFT)))
         self.register_buffer("window", torch.hann_window(N_FFT))
 
     def log_mel(self, samples: Tensor) -> Tensor:
@@ -113,22 +113,6 @@ class WhisperEncoder(nn.Module):
     def _normalised(self, name: str, x: Tensor) -> Tensor:
         gamma, beta = (getattr(self, f"{name}layer_norm_{part}") for part in ("gamma", "beta"))
         return layer_norm(x, gamma.shape, gamma, beta)
-
-
-def mel_filters(count: int) -> np.ndarray:
-    """Triangles of equal area on the scale of Slaney's Auditory Toolbox (1998), (count, N_FFT / 2 + 1) float32.
-
-    That scale is linear below 1 kHz, 15 a kHz, and logarithmic above, 27 to a factor of 6.4.
-    """
-    linear_mels, per_factor = 15.0, 27.0 / np.log(6.4)
-    top = linear_mels + per_factor * np.log(SAMPLE_RATE / 2 / 1000)
-    mels = np.linspace(0, top, count + 2)
-    edges = np.where(mels < linear_mels, mels / linear_mels, np.exp((mels - linear_mels) / per_factor)) * 1000
-    bins = np.fft.rfftfreq(N_FFT, 1 / SAMPLE_RATE)
-    rise = (bins - edges[:-2, None]) / np.diff(edges)[:-1, None]
-    fall = (edges[2:, None] - bins) / np.diff(edges)[1:, None]
-    area = 2.0 / (edges[2:] - edges[:-2])[:, None]
-    return (area * np.maximum(0.0, np.minimum(rise, fall))).astype(np.float32)
 
 
 @torch.no_grad()

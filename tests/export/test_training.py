@@ -18,7 +18,6 @@ from export.items import Items, mapped
 from export.losses import LossWeights, edge_loss, power_law_loss, si_sdr
 from export.network import MOST_LOGITS, EdgeConfig, EdgeCrnn, corrected, count, erb_bands, opened
 from export.paper_network import PaperConfig
-from export.step_times import ROWS
 from export.tasks import FIRST_MASK, EdgeTask, PaperTask, filters_of
 from export.trainer import Plan, optimisers
 from tests.export.speech import write_librispeech, write_table
@@ -529,8 +528,8 @@ def test_where_the_time_of_a_step_goes(data, network, monkeypatch, capsys, tmp_p
     short = ("--hidden", "8", "--batch", "2", "--seconds", "0.5", "--long-every", "0", "--times")
     monkeypatch.setattr("export.step_times.TIMED", 2)
     assert train.main([*folders, "--network", network, *own, *short]) == 0
-    lines = [line.split(" ms")[0].rsplit(maxsplit=1) for line in capsys.readouterr().out.splitlines()]
-    found = {name: float(milliseconds) for name, milliseconds in lines}
-    assert sum(found[row] for row in ROWS) == pytest.approx(found["a step"], rel=0.02, abs=0.5)
-    assert found["convolutions"] > 0 and found["recurrent layers"] > 0 and found["optimiser"] > 0
+    head, *operations = capsys.readouterr().out.splitlines()
+    assert float(head.split(" ms")[0].split()[-1]) > 0 and "2 steps" in head
+    steps = {row[0]: row[-1] for line in operations if (row := line.split()) and row[-1].isdigit()}
+    assert "aten::convolution_backward" in steps and any(name.startswith("Optimizer.step") for name in steps)
     assert not list(tmp_path.glob("*.pt"))

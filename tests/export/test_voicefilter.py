@@ -19,13 +19,16 @@ from edgefilter.errors import ModelError, UsageError
 from export import d_vector, dataset, voicefilter_onnx
 from export import voicefilter as program
 from export.corpus import read_corpus
+from export.crops import Shape
+from export.onnx_export import load
 from export.trainer import Plan
 from export.voicefilter_mixtures import Mixtures, Voices, read_items
 from export.voicefilter_network import VoiceFilter, VoiceFilterConfig
-from export.voicefilter_trainer import VoiceFilterTrainer, load, loss, validate
+from export.voicefilter_trainer import VoiceFilterTask, VoiceFilterTrainer, validate
 from tests.export.speech import babble, write_librispeech, write_table
 
 SMALL = VoiceFilterConfig(64, 32, channels=3, last=2, hidden=6, dense=8)
+TASK = VoiceFilterTask(SMALL, half=False)
 
 
 @pytest.fixture
@@ -89,7 +92,7 @@ def test_gradients_reach_every_weight():
     torch.manual_seed(0)
     network = VoiceFilter(SMALL)
     batch = {"mic": torch.randn(2, 20, 33, 2), "clean": torch.randn(2, 20, 33, 2), "d_vector": torch.randn(2, 256)}
-    loss(network, batch)[0].backward()
+    TASK.loss(network, batch)[0]["total"].backward()
     assert all(weight.grad is not None and weight.grad.any() for weight in network.parameters())
 
 
@@ -173,31 +176,32 @@ def test_a_training_that_was_cut_off_goes_on_to_the_same_weights(items, speech, 
 
     def train(folder: str, drawn: Mixtures) -> Path:
         (tmp_path / folder).mkdir(exist_ok=True)
-        trainer = VoiceFilterTrainer(SMALL, Plan(4, 1e-3, seed=3, every=2), tmp_path / folder, half=False)
-        trainer.run(drawn, data, batch=2, seconds=0.5)
+        trainer = VoiceFilterTrainer(TASK, Plan(4, 1e-3, seed=3, every=2), Shape(2, 0.5, 0), tmp_path / folder)
+        trainer.train(drawn, data)
         return tmp_path / folder
 
     with pytest.raises(KeyboardInterrupt):
         train("parts", stopped)
     whole, parts = (torch.load(train(name, data) / "last.pt", weights_only=True) for name in ("whole", "parts"))
-    assert whole["training"]["step"] == parts["training"]["step"] == 4
+    assert whole["step"] == parts["step"] == 4
     for name, weight in whole["network"].items():
         torch.testing.assert_close(weight, parts["network"][name], rtol=0, atol=0)
     before = (tmp_path / "whole" / "last.pt").read_bytes()
     train("whole", data)  # done already
     assert (tmp_path / "whole" / "last.pt").read_bytes() == before
     with pytest.raises(UsageError, match="channels=3.*expected VoiceFilterConfig.*channels=2.*give the same widths"):
-        VoiceFilterTrainer(replace(SMALL, channels=2), Plan(4, 1e-3, seed=3, every=2), tmp_path / "whole")
+        other = VoiceFilterTask(replace(SMALL, channels=2))
+        VoiceFilterTrainer(other, Plan(4, 1e-3, seed=3, every=2), Shape(), tmp_path / "whole")
 
 
 @pytest.mark.slow
 def test_training_learns_which_bins_are_the_humans(items, speech, tmp_path):
     data = mixtures(items, speech)
-    trainer = VoiceFilterTrainer(SMALL, Plan(60, 1e-2, seed=3, every=60), tmp_path, half=False)
-    before = validate(trainer.network, data)
-    trainer.run(data, data, batch=4, seconds=0.5)
+    trainer = VoiceFilterTrainer(TASK, Plan(60, 1e-2, seed=3, every=60), Shape(4, 0.5, 0), tmp_path)
+    before = validate(TASK, trainer.network, data)
+    trainer.train(data, data)
     after = load(tmp_path / "best.pt").figures
-    assert after["loss"] < 0.7 * before["loss"] and after["held_out"] == len(data.told)
+    assert after["total"] < 0.7 * before["total"] and after["held_out"] == len(data.told)
     assert after["si_sdr_mic_db"] == pytest.approx(before["si_sdr_mic_db"])
     assert {(item.speaker, data.somebody_else(item).speaker) for item in data.told} == {("1", "2"), ("2", "1")}
     assert after["si_sdr_other_db"] != after["si_sdr_db"]
@@ -281,8 +285,8 @@ def test_the_file_computes_what_torch_does_with_weights_as_float16(tmp_path, mon
 
 
 def _checkpoint(folder: Path) -> Path:
-    state = {"config": SMALL.__dict__, "network": VoiceFilter(SMALL).state_dict()}
-    torch.save(state | {"training": {"step": 0}, "figures": {}}, folder / "best.pt")
+    state = {"kind": TASK.kind, "config": TASK.config(), "network": VoiceFilter(SMALL).state_dict()}
+    torch.save(state | {"step": 0, "figures": {}}, folder / "best.pt")
     return folder / "best.pt"
 
 
