@@ -77,6 +77,12 @@ def test_what_stays_of_the_echo_falls_at_once_and_by_no_more_than_26_db() -> Non
     assert told[-1] == pytest.approx(0.0024, rel=1e-3)
 
 
+def test_a_noise_that_was_taken_for_louder_than_all_that_is_left_is_no_echo() -> None:
+    residual, fan = Residual(STFT), np.full(STFT.bins, 0.015, np.float32)
+    first, *_, last = (residual.step(spectrum(1.0), spectrum(0.003), NOTHING, fan=fan)[1].mean() for _ in range(50))
+    assert last < 0.6 * first
+
+
 def test_of_what_is_louder_than_a_tenth_no_more_than_a_tenth_is_put_down_to_the_echo() -> None:
     assert leakage(Residual(STFT), 0.5, 700)[-1] == pytest.approx(0.1, rel=1e-3)
 
@@ -169,6 +175,18 @@ def test_no_bins_noise_is_further_below_the_loudest_than_numbers_reach() -> None
     assert 0.0 < power.max() < 1e-5
 
 
+def test_after_a_mute_as_much_noise_is_left_to_find_again_whatever_the_level() -> None:
+    left = []
+    for level in (1e-6, 1.0, 1e6):
+        tracker = NoiseTracker(STFT.bins)
+        for power in powers(100, level):
+            tracker.step(power)
+        for _ in range(400):
+            tracker.step(NOTHING)
+        left.append(tracker.power.mean() / level)
+    assert left == pytest.approx([left[1]] * 3, rel=1e-2, abs=0.0) and left[1] > 0.0
+
+
 def test_what_no_waveform_predicts_is_expected_as_the_windowed_frame_holds_it() -> None:
     colours = np.ones((2, 601)) / 8000.0
     colours[1] *= np.linspace(0.0, 2.0, 601)
@@ -235,3 +253,24 @@ def test_noise_that_begins_with_the_voice_is_at_first_as_much_as_stays_of_the_ec
     residual.nobody_speaks = True
     residual.step(spectrum(echo), spectrum(motor + fan), NOTHING, fan=fan)
     assert residual.with_voice[151] == pytest.approx(1.05 * 0.005 / STFT.bins, rel=1e-3)
+
+
+def test_noise_is_not_taken_for_motors_while_the_robot_s_echo_is_as_soft() -> None:
+    residual, noise = Residual(STFT), powers(300)
+    residual.nobody_speaks = True
+    for power in noise:
+        residual.step(spectrum(1.0), spectrum(power), NOTHING, fan=NOTHING + 1.0)
+    assert not residual.with_voice.any()
+
+
+def test_of_a_steady_noise_nothing_is_taken_for_motors_though_it_goes_up_and_down() -> None:
+    residual, fan, echo = Residual(STFT), NOTHING + 1.0, NOTHING.copy()
+    echo[20:60] = 1000.0
+    residual.nobody_speaks = True
+    for power in powers(2000):
+        residual.step(spectrum(echo), spectrum(power), NOTHING, fan=fan)
+    without_echo = slice(120, None)
+    assert abs(residual.with_voice[without_echo].mean()) * echo.sum() < 0.1  # of a noise of 1
+    residual.with_voice[:] = -1.0
+    _, left = residual.step(spectrum(echo), spectrum(fan), NOTHING, fan=fan)
+    assert left.min() >= 0.0  # chance makes it negative in some bins: no power is

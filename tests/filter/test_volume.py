@@ -183,6 +183,33 @@ def test_a_suspicion_turns_nothing_where_the_next_hops_fit_the_old_volume_nearly
     assert suspected and not turned and volume.gain == 1.0
 
 
+@pytest.mark.parametrize("path", ["known", "unscaled"])
+def test_an_echo_of_the_other_sign_is_another_path_and_no_volume(path: str) -> None:
+    echo = hops(1.0, 0)
+    volume, turned, suspected = turns(-echo, echo, path)
+    assert volume.gain > 0.5 and not turned and not suspected[12:]
+
+
+def test_no_volume_is_suspected_where_the_robot_is_too_soft_to_be_heard() -> None:
+    """What is suspected keeps the path from being learned meanwhile."""
+    echo = hops(2.0, 0)
+    echo[40:] *= 10 ** (-26 / 20)
+    _, turned, suspected = turns(np.concatenate((echo[:40], 3.0 * echo[40:])), echo)
+    assert not turned and not suspected
+
+
+def test_a_limiter_that_is_told_that_the_volume_was_turned_goes_on_as_if_it_had_always_been_so() -> None:
+    echo, mic = hops(0.5, 0), 0.9 * hops(0.5, 0) + 0.5 * hops(0.5, 1)
+    told, always = EchoLimiter(HOP), EchoLimiter(HOP)
+    for at, (m, e) in enumerate(zip(mic, echo, strict=True)):
+        if at == 20:
+            told.turn(3.0)
+        told.measure(m, np.float32(3.0 if at >= 20 else 1.0) * e)
+        always.measure(m, np.float32(3.0) * e)
+        if at >= 20:
+            assert told.heard == pytest.approx(always.heard, rel=1e-3)
+
+
 def test_an_echo_that_fits_again_is_let_through_at_once() -> None:
     echo = hops(0.5, 0)
     mic = np.concatenate((0.02 * hops(0.5, 1)[:10], 0.7 * echo[10:]))
