@@ -29,7 +29,12 @@ def edge(network: nn.Module, path: Path, frames: int | None = None) -> float:
 
     Raises ModelError where it exceeds TOLERANCE.
     """
-    return _accept(_edge_difference(network, path, FRAMES if frames is None else frames), path)
+    apart = max(
+        float(np.max(np.abs(ours - found)))
+        for wanted, answers in _chained(network, path, FRAMES if frames is None else frames)
+        for ours, found in zip(wanted, answers, strict=True)
+    )
+    return _accept(apart, path)
 
 
 def paper(network: PaperCrnn, path: Path) -> float:
@@ -78,14 +83,6 @@ def _accept(apart: float, path: Path) -> float:
             f"the exported {path.name} is {apart:.1e} from the network, expected at most {TOLERANCE:.0e}: not written"
         )
     return apart
-
-
-def _edge_difference(network: nn.Module, path: Path, frames: int) -> float:
-    return max(
-        float(np.max(np.abs(ours - found)))
-        for wanted, answers in _chained(network, path, frames)
-        for ours, found in zip(wanted, answers, strict=True)
-    )
 
 
 def _edge_ratio_db(network: nn.Module, path: Path, frames: int) -> float:

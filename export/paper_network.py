@@ -1,7 +1,4 @@
-"""The source paper's network, layer by layer as in its Table 1: two convolutional branches, one BLSTM, two dense layers, a soft mask.
-
-python -m export.paper_network      prints its parameter and operation counts
-"""
+"""The source paper's network, layer by layer as in its Table 1: two convolutional branches, one BLSTM, two dense layers, a soft mask."""
 
 from __future__ import annotations
 
@@ -12,7 +9,6 @@ import torch
 from torch import Tensor, nn
 
 from edgefilter.engines.paper_ss import PAPER_STFT
-from edgefilter.types import SAMPLE_RATE
 
 KERNELS = ((1, 7), (7, 1), (5, 5), (5, 5), (5, 5), (5, 5), (5, 5), (1, 1))
 """Width of each convolution, frames x bins."""
@@ -99,20 +95,3 @@ def macs_per_frame(network: PaperCrnn) -> int:
         elif isinstance(module, nn.LSTM | nn.Linear):
             total += sum(weight.numel() for name, weight in module.named_parameters() if name.startswith("weight"))
     return total
-
-
-def macs_per_second(network: PaperCrnn) -> float:
-    """Multiply-accumulates per second of audio at the paper's hop."""
-    return macs_per_frame(network) * SAMPLE_RATE / PAPER_STFT.hop
-
-
-def main() -> None:
-    network = PaperCrnn()
-    print(
-        f"{parameter_count(network) / 1e6:.2f} M parameters, {macs_per_second(network) / 1e9:.1f} GMAC per second of"
-        " audio"
-    )
-
-
-if __name__ == "__main__":
-    main()

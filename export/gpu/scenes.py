@@ -131,7 +131,8 @@ class _Batch:
         settings = (BENCHMARK.setting, self.recipe.setting)
         stages = [settings[int(not p)].draw(rng, bool(w)) for p, w in zip(self.plain, warm, strict=True)]
         echo, uncertainty = self.cancelled(mic, told, warm, profile, stages)
-        lost, weak = (np.array([test(stage.missing_db) for stage in stages]) for test in (_is_lost, _is_weak))
+        missing_db = np.array([np.nan if stage.missing_db is None else stage.missing_db for stage in stages])
+        lost, weak = np.isposinf(missing_db), np.isfinite(missing_db)
         for row in np.flatnonzero(weak):
             taps = self.white(stages[row].missing_taps)
             echo[row] -= 10 ** (stages[row].missing_db / 20) * convolved(echo[row], taps / taps.norm())
@@ -366,14 +367,6 @@ class _Batch:
                     mic[rows], told[rows], hop, stage.taps or taps, adaptation, known
                 )
         return echo, uncertainty
-
-
-def _is_lost(missing_db: float | None) -> bool:
-    return missing_db == np.inf
-
-
-def _is_weak(missing_db: float | None) -> bool:
-    return missing_db is not None and missing_db < np.inf
 
 
 def active_rms(x: Tensor) -> Tensor:
