@@ -40,6 +40,19 @@ def test_hum_goes_within_two_seconds_and_the_voice_above_it_stays(hop, hz):
     np.testing.assert_allclose(through(two, hop)[0][0], left, atol=1e-5)
 
 
+@pytest.mark.parametrize(("share", "known"), [(0.6, True), (0.4, False)])
+def test_hum_is_taken_off_where_it_is_more_than_half_of_what_is_heard(share, known):
+    hum, noise = tones(50.0, 150.0), np.random.default_rng(0).standard_normal(SECONDS.size)
+    noise *= np.sqrt((1.0 - share) / share) * np.std(hum) / np.std(noise)
+    assert through((hum + noise).astype(np.float32))[1] == known
+
+
+def test_a_harmonic_that_is_softer_than_the_mains_is_taken_off_as_well():
+    left, found = through(tones(50.0) + 0.2 * tones(150.0))
+    later = slice(left.size // 2, left.size)
+    assert found and np.mean(left[later] ** 2) < 0.1 * np.mean((0.2 * tones(150.0)[later]) ** 2)
+
+
 @pytest.mark.parametrize("name", ["mic", "reference", "human", "noise", "tone", "offset"])
 def test_what_is_no_hum_stays_bit_for_bit(name):
     known = {

@@ -168,6 +168,26 @@ def test_a_microphone_that_is_left_out_is_not_heard() -> None:
     assert np.abs(spatial.weights[0]).max() < 1e-2 * np.abs(spatial.weights[1:]).max()
 
 
+def test_where_the_first_microphone_is_left_out_the_human_sounds_as_in_the_second() -> None:
+    rng = np.random.default_rng(6)
+    spatial = SpatialFilter(STFT, 3, fan_below())
+    spatial.use(np.array([False, True, True]))
+    human = np.array([[1.0], [2.0], [2.0]], np.float32) * plane_wave(np.array([0.8, 0.0, 0.6]))
+    for _ in range(100):
+        spatial.learn(3.0 * human * complex_noise(rng, STFT.bins), np.ones(STFT.bins, np.float32), SPEECH, True, True)
+    heard = (spatial.step(human[None])[0] / human[1])[8:]
+    assert np.abs(20 * np.log10(np.abs(heard))).max() < 0.5 and np.abs(np.angle(heard)).max() < 0.2
+
+
+@pytest.mark.parametrize("alone", [True, False])
+def test_the_fan_is_known_without_a_calibration_once_it_was_heard_alone_for_long_enough(alone: bool) -> None:
+    rng = np.random.default_rng(7)
+    spatial = SpatialFilter(STFT, 3)
+    for _ in range(100):
+        spatial.learn(complex_noise(rng, 3, STFT.bins), np.zeros(STFT.bins, np.float32), NOISE, False, alone)
+    assert (spatial.fan_psd() is not None) == alone
+
+
 def test_a_turn_as_a_whole_weighs_all_of_it_the_same() -> None:
     rng = np.random.default_rng(7)
     spatial = SpatialFilter(STFT, 3, fan_below())
@@ -177,6 +197,19 @@ def test_a_turn_as_a_whole_weighs_all_of_it_the_same() -> None:
     found = spatial.finished()
     heard = np.einsum("cf,cf->f", found.conj(), human)[8:]
     assert np.abs(20 * np.log10(np.abs(heard))).max() < 0.5
+
+
+def test_a_human_who_walks_within_a_turn_is_changed_as_much_at_its_beginning_as_at_its_end() -> None:
+    ones, places = np.ones(STFT.bins, np.float32), [plane_wave(np.array([x, 0.0, 0.6])) for x in (0.8, -0.8)]
+    changed = []
+    for walk in (places, places[::-1]):
+        rng, spatial = np.random.default_rng(8), SpatialFilter(STFT, 3, fan_below())
+        for place in walk:
+            for _ in range(200):  # as long as the streaming filter remembers
+                spatial.learn(place * complex_noise(rng, STFT.bins), ones, SPEECH, True, True)
+        heard = np.einsum("cf,pcf->pf", spatial.finished().conj(), np.stack(places))
+        changed.append(np.mean(np.abs(heard - 1.0) ** 2, axis=1))
+    np.testing.assert_allclose(changed[0], changed[1], rtol=0.2)
 
 
 def test_a_human_in_a_room_is_changed_less_than_the_fan_is_lowered() -> None:

@@ -307,6 +307,14 @@ def test_ego_filter_counts_and_tells():
     assert hurried.engine_name == "linear"
 
 
+def test_hops_that_are_done_early_are_no_credit_for_one_that_is_late():
+    stepping = Stepping(256)
+    for _ in range(100):
+        stepping.note(0.001)
+    stepping.note(0.1)
+    assert stepping.stats()["most_behind_ms"] == pytest.approx(84.0)
+
+
 def test_histogram_percentiles_are_true_to_a_bin():
     rng = np.random.default_rng(0)
     times = Histogram()

@@ -27,3 +27,10 @@ def test_peak_memory_is_this_process_own_and_not_that_of_the_one_which_started_i
     code = "import numpy; from edgefilter.filter.timing import peak_memory_mb; print(peak_memory_mb())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert 10 < float(done.stdout) < large.nbytes / 2**20 < timing.peak_memory_mb()
+
+
+def test_peak_memory_is_the_most_that_there_was_and_not_what_there_is(monkeypatch, tmp_path):
+    status = tmp_path / "status"
+    status.write_text("VmPeak:\t  999999 kB\nVmHWM:\t   76800 kB\nVmRSS:\t   10240 kB\n")
+    monkeypatch.setattr(timing, "STATUS", status)
+    assert timing.peak_memory_mb() == 75.0
