@@ -16,9 +16,9 @@ APART_DB = 12.0
 was 12 to 18 dB louder (a real robot's noise on four microphones)."""
 SILENT = 1e-6
 """Power, -60 dB, below which a microphone is called silent and not soft, over the loudest one's."""
-CANCELLED, UNLIKE, LEFT = 0.1, 10.0, 0.3
-"""Error over microphone where the robot is the loudest and is cancelled in the best microphone (-10 dB); how many times as
-much is left in one whose path is another than was calibrated: swapped, broken, or processed; and the least of it."""
+UNLIKE, LEFT = 10.0, 0.3
+"""How many times as much of the robot is left in a microphone whose path is another than was calibrated, swapped, broken, or
+processed, as in the best one; and the least of it, over the microphone's power."""
 CLIPPED_DB, MOST_CLIPPED = -0.1, 16
 """Size from which a sample counts as clipped, dB of full scale: conversion to 16 kHz may lower a clipped peak a little; so
 many, 1 ms of them in a block, are no single peak."""
@@ -125,7 +125,7 @@ class Microphones:
         reasons |= self._exchanged
         left = {at: self._errors[at] / power[at] for at in range(self.count) if at not in reasons and power[at] > 0.0}
         least = min(left.values(), default=1.0)
-        for at in left if least < CANCELLED else ():
+        for at in left:
             if left[at] > max(UNLIKE * least, LEFT):
                 told = "hears the robot otherwise than it was calibrated, or than the others: processed, or broken"
                 reasons[at] = told

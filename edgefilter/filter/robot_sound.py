@@ -10,8 +10,8 @@ from edgefilter.types import SAMPLE_RATE, Samples
 
 BANDS, LOWEST_HZ = 20, 100.0
 """Bands as wide as the ear's (mel), and where the lowest begins."""
-KNOWN_S, HEARD_S = 3.0, 4.0
-"""Seconds of robot from which on its sound is known, and seconds of another sound that are compared with it."""
+HEARD_S = 4.0
+"""Seconds of robot from which on its sound is known, and of another sound that are compared with it."""
 MEMORY_S = 20.0
 """Seconds of robot over which its sound is averaged."""
 NOISY = 4.0
@@ -30,7 +30,7 @@ class RobotSound:
 
     def __init__(self, hop: int, bins: int) -> None:
         self._edges = mel_edges(bins, BANDS, LOWEST_HZ)
-        self._known, self._enough, self._most = (round(s * SAMPLE_RATE / hop) for s in (KNOWN_S, HEARD_S, MEMORY_S))
+        self._enough, self._most = (round(s * SAMPLE_RATE / hop) for s in (HEARD_S, MEMORY_S))
         self._robot = np.zeros(self._edges.size)
         self._hops = 0
         self.forget()
@@ -46,7 +46,7 @@ class RobotSound:
 
     def compare(self, power: Samples, noise: Samples) -> bool | None:
         """Take in a hop without a reference; every HEARD_S of sound whether it is the robot, else None. power, noise: (bins,)."""
-        if self._hops < self._known:
+        if self._hops < self._enough:
             return None
         heard = np.add.reduceat(power, self._edges)
         if heard.sum() < AUDIBLE * self._robot.sum():

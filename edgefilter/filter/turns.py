@@ -18,8 +18,6 @@ BEFORE_S = 0.5
 """Of sound before the human was noticed: they had begun to speak, and a recogniser wants some silence first."""
 RECENT_S = 0.3
 """Seconds of output before a beginning or an end of speech that its event carries: the syllable before the human was noticed."""
-LARGEST = 2.0
-"""Most that an answer is taken to be over its error in a bin: engines add no sound, but an error can vanish."""
 WAITING_S = 600.0
 """Of the turns in events that nobody has asked for yet, 38 MB in all; a thousand events could hold a gigabyte."""
 
@@ -51,8 +49,7 @@ class Turns:
         else:
             self._errors[at] = errors
             gain = np.divide(answer, error, out=np.zeros_like(answer), where=error != 0.0)
-            size = np.abs(gain)
-            self._gains[at] = gain * (np.minimum(size, LARGEST) / np.maximum(size, np.float32(1e-9)))
+            self._gains[at] = gain / np.maximum(np.abs(gain), 1.0)  # engines add no sound, but an error can vanish
         self._count += 1
 
     def start(self, waited: int = 0) -> None:
@@ -76,10 +73,9 @@ class Turns:
             spectra = errors[:, 0]
         else:
             spectra = sum(weight.conj() * errors[:, at] for at, weight in enumerate(self._spatial.finished())) * gains
-        hop, window = self._stft.hop, self._stft.window_length
-        late = window - hop
-        # frame t ends with sample (t + 1) hop, and has window samples; the first and the last late samples lack a frame
-        return Turn(max((first + 1) * hop - window, 0) + late, overlap_add(spectra, self._stft)[late : -late or None])
+        late = self._stft.window_length - self._stft.hop
+        # frame t ends with sample (t + 1) hop; the first and the last late samples lack a frame
+        return Turn(first * self._stft.hop, overlap_add(spectra, self._stft)[late : -late or None])
 
     def _grow(self) -> None:
         """Room for twice as many frames, and for a second at first: most streams never need all of it."""
