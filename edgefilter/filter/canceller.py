@@ -170,8 +170,8 @@ class Canceller:
 
     @property
     def history(self) -> int:
-        """Reference samples that rewrite_reference wants, the current hop included."""
-        return (max(self.partitions, PRODUCT_PARTITIONS) + 2) * self.hop
+        """Reference samples that rewrite_reference wants."""
+        return (max(self.partitions, PRODUCT_PARTITIONS) + 1) * self.hop
 
     def reset(self) -> None:
         """Back to the start: the calibrated path, or none, and nothing heard."""
@@ -409,11 +409,10 @@ class Canceller:
     def rewrite_reference(self, history: Samples) -> None:
         """Replace the past of the reference after a realignment.
 
-        history: (n,) float32, the last n reference samples under the new delay, the hop that is about to be stepped
-        included; what is missing of `self.history` samples counts as silence.
+        history: (n,) float32, the last n reference samples under the new delay before the hop that is about to be stepped;
+        what is missing of `self.history` samples counts as silence.
         """
-        known = np.concatenate((np.zeros(self.history), history), dtype=np.float32)[-self.history :]
-        past = known[: -self.hop]
+        past = np.concatenate((np.zeros(self.history), history), dtype=np.float32)[-self.history :]
         channels = past[None]
         if self.adaptation.products:
             self._moving = np.zeros(DISPLACEMENT_TAPS - 1, np.float32)

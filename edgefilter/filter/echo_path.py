@@ -46,18 +46,16 @@ class EchoPath:
     @property
     def history(self) -> int:
         """Reference samples that `past` is to hold at least."""
-        return max(self.canceller.history, self.source.memory)
+        return max(self.canceller.history, self.source.memory) + self.canceller.hop
 
     def step(self, mic: Samples, reference: Samples, located: bool, past: Samples | None = None) -> CancellerOutput:
         """One hop (hop,) of the microphone, of an array (microphones, hop), and of the aligned reference (hop,).
 
         past: (n,) the aligned reference up to and with this hop where its delay was switched in it, else None.
         """
-        before = None if past is None else self.source.restart(past[: -reference.size])
-        driven = self.source(reference)
-        if before is not None:
-            self.canceller.rewrite_reference(np.concatenate((before, driven)))
-        return self.canceller.step(mic, driven, located)
+        if past is not None:
+            self.canceller.rewrite_reference(self.source.restart(past[: -reference.size]))
+        return self.canceller.step(mic, self.source(reference), located)
 
     def state(self) -> PathState:
         """Copies of what it knows."""
@@ -67,8 +65,7 @@ class EchoPath:
     def resumed(cls, state: PathState, past: Samples, hop: int) -> EchoPath:
         """The path of that state. past: (n,) the aligned reference up to and with the hop that is stepped next."""
         path = cls(Canceller.resumed(state.canceller, hop), state.effects)
-        before = path.source.restart(past[:-hop])
-        path.canceller.rewrite_reference(np.concatenate((before, np.zeros(hop, np.float32))))
+        path.canceller.rewrite_reference(path.source.restart(past[:-hop]))
         return path
 
 

@@ -235,7 +235,7 @@ def test_rewritten_reference_equals_a_reference_that_always_had_the_new_delay() 
     for i in range(0, at, HOP):
         switched.step(silence, silence)
         always.step(mic[i : i + HOP], moved[i : i + HOP], located=False)  # it adapts to nothing, as the other one
-    switched.rewrite_reference(moved[: at + HOP][-switched.history :])
+    switched.rewrite_reference(moved[:at][-switched.history :])
     for i in range(at, at + SETTLED, HOP):
         a, b = (one.step(silence, moved[i : i + HOP], located=False).innovation for one in (switched, always))
     # identical spectra up to float32 rounding
@@ -280,7 +280,7 @@ def test_the_past_of_a_voice_that_grows_louder_is_what_it_would_be_had_its_level
         levels.add(streamed.state().loudest)
         if at >= 24 * HOP:
             knowing = anything(streamed.state().loudest, shelves)
-            knowing.rewrite_reference(x[: at + HOP])
+            knowing.rewrite_reference(x[:at])
             (b,) = heard_of(knowing, x[at : at + HOP])
             # float32, and a low-pass of the history that begins at its first sample
             np.testing.assert_allclose(a.innovation, b.innovation, atol=1e-5 * np.abs(b.innovation).max())
@@ -323,7 +323,7 @@ def test_a_filter_that_was_resumed_goes_on_as_one_that_was_not(microphones: int 
     for i in range(0, at, HOP):
         canceller.step(mic[..., i : i + HOP], x[i : i + HOP])
     resumed = Canceller.resumed(canceller.state(), HOP)
-    resumed.rewrite_reference(x[:end])
+    resumed.rewrite_reference(x[:at])
     assert resumed.impulse_response().shape == (*mic.shape[:-1], canceller.taps)
     for one in (canceller, resumed):
         out = one.step(mic[..., at:end], x[at:end])
