@@ -7,15 +7,16 @@ import pytest
 from scipy import signal
 
 from edgefilter import enhance
+from edgefilter.alignment.aligner import Aligned, Aligner
 from edgefilter.alignment.delay_line import WAIT
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.linear import Linear
 from edgefilter.filter.budget import DEMO
 from edgefilter.filter.echo_path import PathState, PathUpdate
-from edgefilter.filter.front_end import RUMBLE, FrontEnd
+from edgefilter.filter.front_end import RUMBLE, Centred, FrontEnd
 from edgefilter.filter.residual_echo import Residual
 from edgefilter.session import level_db
-from edgefilter.types import SAMPLE_RATE
+from edgefilter.types import SAMPLE_RATE, Output
 from tests.conformance import robot
 from tests.program import demo
 
@@ -111,6 +112,80 @@ def test_a_lesson_is_faded_in_over_the_hop_in_which_it_is_adopted():
     assert np.abs(plain.linear.echo).max() > 0.05
     np.testing.assert_allclose(taught.linear.echo, np.linspace(1.0, 0.0, 256) * plain.linear.echo, atol=1e-6)
     assert np.array_equal(taught.linear.error, taught.heard - taught.linear.echo)
+
+
+class Scripted(Aligner):
+    """Says what it is told to of each hop, of a reference that is not late."""
+
+    def __init__(self, *states: str) -> None:
+        super().__init__(256)
+        self.states = iter(states)
+
+    def step(self, mic, ref):
+        state = next(self.states)
+        return Aligned(ref, 0.0, 0.0, 1.0, state.removesuffix("!"), False, at_any_lag=state.endswith("!"))
+
+
+def scripted(*states: str, learner=None) -> tuple[FrontEnd, list]:
+    """A front end that has stepped through these states, and its frames; the microphone hears the reference by half."""
+    front = FrontEnd(Linear(), robot(), learner, aligner=Scripted(*states))
+    hops = 0.1 * np.random.default_rng(0).standard_normal((len(states), 256)).astype(np.float32)
+    frames = []
+    for hop in hops:
+        frames.append(front.step(0.5 * hop, hop)[0])
+        front.linear_stage.learn()
+    return front, frames
+
+
+def test_a_frame_may_hold_the_robot_at_any_lag_where_one_of_its_two_hops_may():
+    _, frames = scripted("locked", "begun!", "locked", "locked", "unfound!")
+    assert [frame.at_any_lag for frame in frames] == [False, True, True, False, True]
+
+
+@pytest.mark.parametrize("state", ["begun", "announced", "locked", "coarse", "lost"])
+def test_the_path_is_learned_only_where_the_reference_is_known_to_lie_where_it_is_heard(state):
+    front, _ = scripted(*[state] * 40)
+    learned = front.linear_stage.stats()["active_hops"] > 0
+    assert learned == (state not in ("begun", "announced"))
+
+
+class Watching:
+    """Keeps what a learner is told."""
+
+    def __init__(self):
+        self.told = []
+
+    def start(self, path, hop):
+        pass
+
+    def observe(self, hop):
+        self.told.append(hop)
+
+
+def test_a_learner_is_told_in_which_hops_nothing_of_the_robot_can_be_heard_and_where_its_place_is_known():
+    learner = Watching()
+    scripted("idle", "begun", "locked", learner=learner)
+    assert [hop.idle for hop in learner.told] == [True, False, False]
+    assert [hop.located for hop in learner.told] == [True, False, True]
+
+
+@pytest.mark.parametrize(
+    ("probability", "speaking", "nobody"),
+    [(None, False, False), (0.1, False, True), (0.1, True, False), (0.9, True, False)],
+)
+def test_nobody_speaks_where_an_engine_that_judges_it_says_so(probability, speaking, nobody):
+    front, frames = scripted("locked", "locked")
+    front.hear(frames[-1], Output(frames[-1].error, probability), probability, speaking)
+    assert front.linear_stage.residual.nobody_speaks == nobody
+
+
+def test_a_constant_offset_is_off_within_some_hops_and_one_that_moves_is_followed():
+    rng, centred = np.random.default_rng(0), Centred(256)
+    noise = 0.01 * rng.standard_normal((400, 256)).astype(np.float32)
+    offset = np.where(np.arange(400) < 200, 0.1, -0.1).astype(np.float32)[:, None]
+    left = np.array([centred.step(hop).mean() for hop in noise + offset])
+    assert np.abs(left[:200]).max() < 0.005  # from the first hop on
+    assert np.abs(left[360:]).max() < 0.005 < np.abs(left[200])
 
 
 def test_an_offset_of_the_microphone_leaves_the_robot_removed_and_is_removed_itself():

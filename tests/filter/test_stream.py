@@ -5,12 +5,12 @@ import contextlib
 import numpy as np
 import pytest
 
-from edgefilter import EgoFilter, enhance
+from edgefilter import EgoFilter, engines, enhance
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.linear import Bypass
 from edgefilter.errors import SignalError, UsageError
-from edgefilter.filter.stream import Stream
-from edgefilter.types import Output
+from edgefilter.filter.stream import Stream, step
+from edgefilter.types import Frame, Output
 from tests import conformance
 
 
@@ -181,3 +181,21 @@ def test_events_that_nobody_asks_for_hold_the_sound_of_the_latest_ten_minutes():
     assert len(ends) > 20 and kept == sorted(kept) and not kept[0]
     held = sum(event.turn.samples.size for event in ends if event.turn)
     assert 570 * 16_000 < held <= 600 * 16_000
+
+
+@pytest.mark.parametrize("name", ["linear", "ss", "crnn"])
+def test_of_what_may_be_the_robot_at_any_lag_no_more_than_the_noise_is_delivered_and_nothing_is_remembered(name):
+    engine = engines.create(name)
+    rng, bins = np.random.default_rng(0), engine.stft.bins
+    spectra = (rng.standard_normal((4, bins)) + 1j * rng.standard_normal((4, bins))).astype(np.complex64)
+    noise, echo = np.full(bins, 0.01, np.float32), np.ones(bins, np.float32)
+    frame = Frame(*spectra, noise, echo, at_any_lag=True)
+    state = engine.initial_state()
+    output, after = step(engine, frame, state)
+    assert after is state and not output.speech_probability
+    assert np.all(np.abs(output.spectrum) ** 2 <= noise)
+    softer = frame._replace(error=1e-3 * frame.error)  # than the noise is said to be: nothing is made louder
+    assert np.all(np.abs(step(engine, softer, state)[0].spectrum) <= np.abs(softer.error))
+    known, _ = step(engine, frame._replace(at_any_lag=False), state)
+    assert (known.speech_probability is None) == (output.speech_probability is None)
+    assert not np.allclose(known.spectrum, output.spectrum, atol=1e-3)
