@@ -73,18 +73,22 @@ def make_folder(folder: Path, purpose: str) -> None:
 
 
 @contextmanager
-def whole(path: str | Path) -> Iterator[BinaryIO]:
-    """A file to write, of which no part is left where the writing fails or is interrupted; raises OSError."""
-    file = open(path, "wb")  # noqa: SIM115
+def whole(path: str | Path, what: str) -> Iterator[BinaryIO]:
+    """A file to write, of which no part is left where the writing fails or is interrupted; AudioFileError says what it was to be."""
     try:
-        with file:
-            yield file
-    except BaseException:
-        written = Path(path).resolve()
-        if written.is_file():
-            with suppress(OSError):
-                written.unlink()
-        raise
+        file = open(path, "wb")  # noqa: SIM115
+        try:
+            with file:
+                yield file
+        except BaseException:
+            written = Path(path).resolve()
+            if written.is_file():
+                with suppress(OSError):
+                    written.unlink()
+            raise
+    except OSError as error:
+        why = f"cannot be written ({error.strerror or error}); name a file in a folder that exists"
+        raise AudioFileError(f"{path}: {what} {why}") from None
 
 
 class FileSource(Source):

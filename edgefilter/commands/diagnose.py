@@ -128,12 +128,7 @@ def _written(args: argparse.Namespace, found: Diagnosis, following: str) -> tupl
     if found.law is None:
         return f"no law explains much more than what is named: {args.write_effect} is not written", following
     path = Path(args.write_effect)
-    try:
-        with whole(path) as file:
-            file.write(found.law.file(path.stem).encode())
-    except OSError as error:
-        raise EdgefilterError(
-            f"{path} cannot be written ({error.strerror}); name a file in a folder that exists"
-        ) from None
+    with whole(path, "the effect") as file:
+        file.write(found.law.file(path.stem).encode())
     own = {**vars(args), "effects": [*(args.effects or ()), args.write_effect]}
     return f"own effect  {path}", add_command([*found.law.beside, path.stem], own)

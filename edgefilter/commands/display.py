@@ -19,7 +19,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 from edgefilter.audio.files import whole
-from edgefilter.errors import AudioFileError, UsageError
+from edgefilter.errors import UsageError
 from edgefilter.types import SAMPLE_RATE, SET_UP_WRONG, Event, Stats
 
 if TYPE_CHECKING:
@@ -247,10 +247,5 @@ def write_json(data: object, path: str) -> None:
     if path == "-":
         print(text)
         return
-    try:
-        with whole(path) as file:
-            file.write(f"{text}\n".encode())
-    except OSError as error:
-        raise AudioFileError(
-            f"cannot write {path}: {error.strerror}: choose a folder that exists and can be written"
-        ) from None
+    with whole(path, "the JSON") as file:
+        file.write(f"{text}\n".encode())

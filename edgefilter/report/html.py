@@ -22,7 +22,6 @@ from edgefilter.diagnosis.result import Diagnosis, Finding, Precision, in_order
 from edgefilter.diagnosis.straightened import Straightened
 from edgefilter.diagnosis.trials import less
 from edgefilter.echo.model import EchoModel
-from edgefilter.errors import EdgefilterError
 from edgefilter.report import passport, text
 from edgefilter.report.media import MAX_SOUND_S, colour_scale, colours, sound, spectrogram_png
 from edgefilter.types import SAMPLE_RATE, Samples
@@ -114,14 +113,9 @@ def passport_page(found: Passport, diagnosis: str, names: Mapping[str, Any]) -> 
 
 
 def write_page(path: str | Path, page: str) -> None:
-    """Write the page; raises EdgefilterError where it cannot be written."""
-    try:
-        with whole(path) as file:
-            file.write(page.encode(errors="backslashreplace"))
-    except OSError as error:
-        raise EdgefilterError(
-            f"{path}: the report cannot be written ({error.strerror}); name a .html file in a folder that exists"
-        ) from None
+    """Write the page; raises AudioFileError where it cannot be written."""
+    with whole(path, "the report") as file:
+        file.write(page.encode(errors="backslashreplace"))
 
 
 def _page(

@@ -136,10 +136,10 @@ def _figure(width: float, height: float) -> Figure:
 
 def _save(figure: Figure, path: str | Path) -> None:
     try:
-        with whole(path) as file:
+        with whole(path, "the picture") as file:
             figure.savefig(file, format=Path(path).suffix[1:] or "png")
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
+    except ValueError as error:
+        reason = str(error).splitlines()[0]
         raise EdgefilterError(
-            f"{path}: the picture cannot be written ({reason}); name a .png, .svg or .pdf file in a folder that exists"
+            f"{path}: the picture cannot be written ({reason}); name a .png, .svg or .pdf file"
         ) from None

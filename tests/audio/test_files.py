@@ -260,7 +260,7 @@ def test_figures_pages_and_pictures_that_do_not_fit_on_a_disk_leave_no_part_behi
 def test_an_interrupt_while_a_file_is_written_leaves_no_part_behind_nor_harms_a_device(tmp_path):
     (tmp_path / "null").symlink_to(os.devnull)
     for name in ("page.html", "null"):
-        with pytest.raises(KeyboardInterrupt), whole(tmp_path / name) as file:
+        with pytest.raises(KeyboardInterrupt), whole(tmp_path / name, "the page") as file:
             file.write(b"the beginning")
             raise KeyboardInterrupt
     assert os.path.exists(os.devnull) and [path.name for path in tmp_path.iterdir()] == ["null"]
