@@ -188,6 +188,19 @@ def test_a_constant_offset_is_off_within_some_hops_and_one_that_moves_is_followe
     assert np.abs(left[360:]).max() < 0.005 < np.abs(left[200])
 
 
+def test_what_the_first_hop_says_of_the_offset_is_soon_outweighed():
+    centred, hops = Centred(256), np.zeros((40, 256), np.float32)
+    hops[0] = 0.1
+    left = np.array([centred.step(hop).mean() for hop in hops])
+    assert np.abs(left[10:]).max() < 0.02
+
+
+@pytest.mark.parametrize("state", ["begun", "locked"])
+def test_how_much_is_removed_is_told_of_hops_whose_reference_lies_where_it_is_heard(state):
+    front, _ = scripted(*[state] * 250)
+    assert (front.linear_stage.stats()["removed_db"] is not None) == (state == "locked")
+
+
 def test_an_offset_of_the_microphone_leaves_the_robot_removed_and_is_removed_itself():
     """-30 dB of full scale, as cheap microphones have: 5 to 7 dB less were removed, and the robot's path learned in vain."""
     mic, ref = demonstration()
