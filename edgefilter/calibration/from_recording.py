@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,21 +116,25 @@ def self_calibrate(recording: Samples, reference: Samples, *, sample_rate: int =
     path = fit_path(sound, target, weights, float(np.square(rough).max()))
     predicted = filtered(sound, path, 0)
     _check_learned(target, predicted, fit, delay, ppm, believed.missing)
-    bands, snr = bands_over_fan(predicted)
     echo = EchoModel(path.astype(np.float32))
     for effect in EFFECTS:  # those that come with the package: whoever loads the profile knows no others
         if effect.absorbed or effect.stage == "noise":
             echo = echo.with_effect(effect.name, {})
+    warnings = tuple(_warnings(seconds, others(target, predicted)))
+    return replace(profile_of(echo, delay, psd, predicted), warnings=warnings, source=PROVISIONAL)
+
+
+def profile_of(echo: EchoModel, delay: float, noise_psd: Samples, predicted: Samples) -> Profile:
+    """The profile of a path that speech has shown, which tells no distortion; predicted: (n,), what it makes of it, whitened."""
+    bands, snr = bands_over_fan(predicted)
     return Profile(
         echo=echo,
         delay=float(delay),
-        response=np.abs(fft.rfft(path, 16 * GRID_FFT))[::16].astype(np.float32),
-        noise_psd=psd,
+        response=np.abs(fft.rfft(echo.impulse_response, 16 * GRID_FFT))[::16].astype(np.float32),
+        noise_psd=noise_psd,
         band_hz=bands,
         band_snr_db=snr,
         distortion_db=np.zeros(len(DISTORTION_ORDERS)),
-        warnings=tuple(_warnings(seconds, others(target, predicted))),
-        source=PROVISIONAL,
     )
 
 

@@ -9,11 +9,10 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from scipy import fft
 
 from edgefilter.alignment.utterances import Sustained
 from edgefilter.calibration.calibrate import cross_density, first
-from edgefilter.calibration.from_recording import bands_over_fan, fan_in_silences
+from edgefilter.calibration.from_recording import fan_in_silences, profile_of
 from edgefilter.dsp.psd import floored, periodograms
 from edgefilter.echo.effect import vanishes
 from edgefilter.echo.effects.catalogue import EFFECTS, find
@@ -25,7 +24,7 @@ from edgefilter.filter.echo_path import PAST, TAPS, EchoPath, Effects, FilteredH
 from edgefilter.filter.volume import AUDIBLE, WITNESSES
 from edgefilter.learning.history import MINUTE, RECENT_S, HopHistory, emphasised
 from edgefilter.profile.array import ArrayCalibration
-from edgefilter.profile.data import DISTORTION_ORDERS, GRID_FFT, LEARNED, Profile
+from edgefilter.profile.data import GRID_FFT, LEARNED, Profile
 from edgefilter.types import SAMPLE_RATE, EventKind, Samples, expect_positive
 
 BEFORE = "the path of before"
@@ -292,16 +291,6 @@ def learned_profile(base: Profile | None, path: EchoPath, history: HopHistory) -
         array = ArrayCalibration(response[1:], cross_density(history.noise()))
         response = response[0]
     echo = EchoModel(response, path.effects)
-    bands, snr = bands_over_fan(whiten(echo.predict(history.signal("reference")), noise_psd))
-    return Profile(
-        echo=echo,
-        delay=history.delay,
-        response=np.abs(fft.rfft(response, 16 * GRID_FFT))[::16].astype(np.float32),
-        noise_psd=noise_psd,
-        band_hz=bands,
-        band_snr_db=snr,
-        distortion_db=np.zeros(len(DISTORTION_ORDERS)),
-        created=today,
-        source=LEARNED,
-        array=array,
-    )
+    predicted = whiten(echo.predict(history.signal("reference")), noise_psd)
+    made = profile_of(echo, history.delay, noise_psd, predicted)
+    return replace(made, created=today, source=LEARNED, array=array)
