@@ -13,7 +13,7 @@ from itertools import pairwise
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.ordinary import p_value
 from edgefilter.diagnosis.straightened import Straightened
-from edgefilter.diagnosis.trials import Found, Trial, Workbench, added, noisy, steps_of
+from edgefilter.diagnosis.trials import AHEAD, Found, Trial, Workbench, added, noisy, steps_of
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.model import EchoModel
 
@@ -48,7 +48,7 @@ def _stepwise(bench: Workbench, start: EchoModel) -> Iterator[EchoModel]:
     model, enough_db = start, bench.criteria.silent_db
     while len(added(start, model)) < bench.criteria.most_effects and (bench.off_db(model) > enough_db or noisy(model)):
         bench.so_far(model)
-        newest = forward(bench, model)
+        newest = forward(bench, start, model)
         if newest is None:
             return
         before_db, grown = bench.score(model).level_db, refit(bench, start, newest.model)
@@ -60,32 +60,54 @@ def _stepwise(bench: Workbench, start: EchoModel) -> Iterator[EchoModel]:
         yield standing(bench, start, model)
 
 
-def forward(bench: Workbench, model: EchoModel) -> Trial | None:
-    """The effect to accept next: it explains a good part of what is left."""
-    return bench.preferred(trial for trial in bench.attempt_all(model) if bench.worth(trial, model))
+def forward(bench: Workbench, start: EchoModel, model: EchoModel) -> Trial | None:
+    """The effect to accept next: it explains a good part of what is left.
+
+    Where that is much, a nonlinear loudspeaker is tried behind the filters as well, and noise where nothing else explains it.
+    """
+    found = [trial for trial in bench.attempt_all(model) if bench.worth(trial, model)]
+    if not bench.little(model) and all(find(trial.name).learned for trial in found):
+        found += [trial for trial in _behind_a_filter(bench, start, model) if bench.worth(trial, model)]
+        found = found or [trial for trial in bench.attempt_last(model) if bench.worth(trial, model)]
+    return bench.preferred(found)
+
+
+def _behind_a_filter(bench: Workbench, start: EchoModel, model: EchoModel) -> Iterator[Trial]:
+    """The filter of a model moved ahead of the loudspeaker, alone and with a nonlinear loudspeaker behind it.
+
+    Which of the two comes first shows in the products alone. So all are fitted in turn before they are judged.
+    """
+    moved, before = bench.filtered_ahead(model), bench.score(model)
+    if moved is None:
+        return
+    yield Trial.of(AHEAD, moved, before, bench.score(moved))
+    for name in bench.absent(moved):
+        if find(name).learned and (bent := bench.attempt(name, moved)):
+            together = refit(bench, start, bent.model)
+            if standing(bench, start, together) is together:
+                yield Trial.of(name, together, before, bench.score(together))
 
 
 def refit(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
-    """Each effect beyond start fitted beside the others, in turn, as long as the held-out level falls."""
+    """Each effect beyond start fitted beside the others, in turn, as long as a round of that lowers the held-out level: one fit may raise it."""
     listed, worth = added(start, model), bench.criteria.worth_db
     if len(listed) < 2:
         return model
     waiting = listed[:-1]  # the newest was just fitted beside them
     for _ in range(bench.criteria.rounds):
-        before = bench.score(model).level_db
+        again = model
         for name in waiting:
-            again = bench.attempt(name, bench.less(model, name))
-            if again is not None and again.score.level_db < bench.score(model).level_db - 0.5 * worth:
-                model = again.model
-        if before - bench.score(model).level_db < worth:
+            fitted = bench.attempt(name, bench.less(again, name))
+            again = fitted.model if fitted else again
+        if bench.score(model).level_db - bench.score(again).level_db < worth:
             break
-        waiting = listed
+        model, waiting = again, listed
     return model
 
 
 def backward(bench: Workbench, start: EchoModel, model: EchoModel, newest: str) -> EchoModel:
     """The model without what the newest effect has made superfluous: an earlier one exchanged for the one to name beside it, or dropped."""
-    for name in [name for name in added(start, model) if name != newest]:
+    for name in [name for name in added(start, model) if name != newest and not find(name).free]:
         model = _exchange(bench, start, model, name)
     return without_superfluous(bench, start, model, newest)
 

@@ -222,31 +222,24 @@ class Workbench:
         return self._attempt_in_turn([one.name for one in simpler if not (rigid and one.flexible)], model)
 
     def attempt_all(self, model: EchoModel) -> list[Trial]:
-        """Try each effect that the model lacks.
+        """Try each effect that the model lacks, but for the last resorts."""
+        return self._attempt_in_turn([name for name in self.absent(model) if not find(name).last_resort], model)
 
-        If none of them explains a good part of the residual, a nonlinear loudspeaker with a filter ahead of it is tried; if that
-        does not either, the last resorts.
-        """
-        absent = self.absent(model)
-        found = self._attempt_in_turn([name for name in absent if not find(name).last_resort], model)
-        if self.little(model) or any(self.worth(trial, model) for trial in found):
-            return found
-        if moved := self.filtered_ahead(model):
-            instead = Trial.of(AHEAD, moved, self.score(model), self.score(moved))
-            if self.worth(instead, model):
-                return [instead]
-            bends = [name for name in absent if find(name).learned]
-            behind = [trial for name in bends if (trial := self.attempt(name, moved)) is not None]
-            if any(self.worth(trial, moved) for trial in behind):
-                return behind
-        resorts = (self.attempt(name, model) for name in absent if find(name).last_resort)
-        return found + [trial for trial in resorts if trial is not None]
+    def attempt_last(self, model: EchoModel) -> list[Trial]:
+        """Try each of the last resorts that the model lacks."""
+        resorts = (self.attempt(name, model) for name in self.absent(model) if find(name).last_resort)
+        return [trial for trial in resorts if trial is not None]
 
     def filtered_ahead(self, model: EchoModel) -> EchoModel | None:
-        """The model with its filters of the echo path replaced by one filter ahead of the loudspeaker; None if it has none on the path."""
-        others = reduce(self.less, filter(_on_path, added(self._start, model)), model)
-        ahead = None if others is model else self.attempt(AHEAD, others)
-        return ahead.model if ahead else None
+        """The model with one filter ahead of the loudspeaker for those of the echo path; the room is fitted anew. None if it has no such filter."""
+        has = added(self._start, model)
+        filters = [name for name in has if find(name).absorbed and find(name).stage != "source"]
+        if AHEAD in has or not filters:
+            return None
+        ahead = self.attempt(AHEAD, reduce(self.less, filters, model))
+        room = next((name for name in filters if find(name).stage == "response"), None)
+        again = self.attempt(room, ahead.model) if ahead and room else ahead
+        return again.model if again else None
 
     def known_by(self, law: Trial) -> Reading | None:
         """The listed filter on the path that explains most of what a law's filter does by itself."""

@@ -20,10 +20,11 @@ from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.recording import diagnose
 from edgefilter.diagnosis.trials import Found, Trial
 from edgefilter.echo.effects import catalogue
+from edgefilter.echo.model import EchoModel
 from edgefilter.echo.running import stream_form
 from edgefilter.report.text import heading
 from edgefilter.types import SAMPLE_RATE
-from tests.diagnosis.robot_scene import profile, record, voice
+from tests.diagnosis.robot_scene import livelier, profile, record, voice
 
 X = voice(6.0)
 LEVEL = np.sqrt(signal.lfilter([0.005], [1.0, -0.995], X**2) + 1e-9)
@@ -259,6 +260,18 @@ def test_an_equaliser_ahead_of_what_bends_the_voice_is_told_from_one_behind() ->
     assert found.ranking[0].effect == "free_filter_ahead" and found.ranking[0].like.share > 0.9
     assert "a filter of 8 ms" in found.ranking[0].evidence
     assert found.comparison.excess_db > 20.0 and found.remaining_db < 1.0  # with the equaliser behind: 15
+
+
+@pytest.mark.slow
+def test_an_equaliser_ahead_of_what_bends_the_voice_is_found_though_another_room_has_taken_it_up() -> None:
+    """The response of the room holds any filter, and the products that tell where it is show in one place alone: a codec was named."""
+    x = voice(16.0)
+    bell, high = (signal.lfilter(*signal.iirpeak(hz, q, fs=SAMPLE_RATE), x) for hz, q in ((400.0, 0.8), (2500.0, 1.2)))
+    coloured = x + 1.5 * bell - 0.5 * high
+    heard = record((np.tanh(8.0 * coloured) / 8.0).astype(np.float32), EchoModel(livelier()))
+    found = diagnose(profile(), heard, x)
+    assert sorted(finding.name for finding in found.ranking) == ["equaliser", "late_reverb", "speaker_nonlinearity"]
+    assert found.comparison.excess_db > 20.0 and found.remaining_db < 1.0
 
 
 def test_what_a_name_is_of_a_law_counts_after_what_the_law_made_superfluous_is_dropped() -> None:
