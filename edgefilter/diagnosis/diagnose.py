@@ -73,7 +73,8 @@ def conclude(
         found = found.with_only(shown)  # silences and voice both show it
     unpredictable = any(find(step.name).adds_noise for step in found.steps)
     remaining = found.final.excess_db
-    findings, doubts = findings_of(found, progress)
+    known, intervals, doubts = precision(found, progress)
+    findings = findings_of(found, intervals)
     tried = candidates(searched, [finding.effect for finding in findings])
     return Diagnosis(
         verdict=verdict,
@@ -89,7 +90,7 @@ def conclude(
         independence=independence_of(found.recording, found.model, found.final)
         if findings
         else comparison.independence,
-        precision=precision(found, findings),
+        precision=known,
         advice=asks(tried),
         law=law_of(found),
     )

@@ -13,7 +13,7 @@ from scipy import signal
 
 from edgefilter.cli import main
 from edgefilter.diagnosis.criteria import Criteria
-from edgefilter.diagnosis.findings import findings_of
+from edgefilter.diagnosis.precision import precision
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.recording import Recording, add, compare, diagnose
 from edgefilter.diagnosis.straightened import bands
@@ -95,10 +95,10 @@ def test_the_words_name_a_band_of_the_scorer() -> None:
 
 
 class Fragile(Effect):
-    """A delay of one sample, mixed in; its fit fails as asked."""
+    """A delay of one sample, mixed in, and how much of it is told once more; its fit fails as asked."""
 
     name, stage, title, complexity = "fragile", "path", "a fragile thing", 0
-    parameters = (Parameter("amount", "1", 0.0, -1.0, 1.0),)
+    parameters = (Parameter("amount", "1", 0.0, -1.0, 1.0), Parameter("read_off", "1", 0.0, -1.0, 1.0))
     failures: list[Exception] = []
 
     def apply(self, x, values, sample_rate):
@@ -109,7 +109,8 @@ class Fragile(Effect):
             raise self.failures.pop()
         predicted, white = measurement.predicted(model)[1], measurement.white_recording
         late = np.append(0, predicted[:-1]) * measurement.weights
-        return {"amount": float(np.clip(np.dot(white - predicted, late) / np.dot(late, late), -1, 1))}
+        amount = float(np.clip(np.dot(white - predicted, late) / np.dot(late, late), -1, 1))
+        return {"amount": amount, "read_off": amount}
 
 
 @pytest.fixture
@@ -128,8 +129,9 @@ def test_an_interval_fit_that_fails_does_not_kill_a_finished_diagnosis(fragile, 
     step = bench.attempt("fragile", prepared.model)
     found = Found(prepared, prepared.model, step.model, bench.score(prepared.model), step.score, (step,))
     fragile.failures.extend([np.linalg.LinAlgError("Singular matrix")] * failing)
-    (finding,), doubts = findings_of(found, None)
-    interval = finding.parameters["amount"]
+    _, intervals, doubts = precision(found)
+    moved, interval = intervals["fragile"].values()
+    assert 0.3 < moved.low < moved.high < min(0.5, moved.low + 0.01), "known without a further fit"
     assert len(doubts) == failing and "Singular matrix" in doubts[0] and "fragile" in doubts[0]
     assert (interval.low > 0.3 and interval.high < 0.5) if known else (interval.low, interval.high) == (-1.0, 1.0)
 

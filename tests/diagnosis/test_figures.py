@@ -52,11 +52,19 @@ def test_a_number_beside_which_the_effect_cannot_be_applied_has_the_scatter_of_t
     def fails(*arguments):
         raise error
 
-    known = SimpleNamespace(value=-2.0, low=-3.0, high=-1.0)
-    finding = SimpleNamespace(effect="playback_gain", values={"gain_db": -2.0}, parameters={"gain_db": known})
-    found = SimpleNamespace(in_noise=SimpleNamespace(measurement=None), model=SimpleNamespace(with_effect=fails))
-    (number,) = precision(found, [finding]).numbers
-    assert number.source == "thirds"
+    fits = iter([-2.1, -2.0, -1.8])
+    part = SimpleNamespace(fitted=lambda name, model: {"gain_db": next(fits)})
+    found = SimpleNamespace(
+        steps=(SimpleNamespace(name="playback_gain", values={"gain_db": -2.0}),),
+        recording=SimpleNamespace(usable=np.ones(SAMPLE_RATE, bool), fitted_to=lambda fit: part),
+        in_noise=SimpleNamespace(measurement=None),
+        model=SimpleNamespace(with_effect=fails, without_effect=lambda name: None),
+    )
+    known, intervals, doubts = precision(found)
+    (number,) = known.numbers
+    assert number.source == "thirds" and not doubts
+    interval = intervals["playback_gain"]["gain_db"]
+    assert -2.5 < interval.low < -2.1 and -1.8 < interval.high < -1.5
 
 
 @pytest.mark.parametrize("later", [-1000, 0, 1000])

@@ -203,7 +203,7 @@ def test_a_law_in_place_of_a_name_that_leaves_much_says_what_it_is_most_like_and
     assert share == pytest.approx(named.steps[0].gain_db / step.gain_db), (
         "of what the law brings, what the name's numbers do"
     )
-    (finding,), _ = findings_of(better, None)
+    (finding,) = findings_of(better, {})
     assert (finding.effect, finding.name) == ("free_gain", "compression")
     assert heading(finding) == f"Compression, {100 * share:.0f} % of a gain by level"
     knowing, before, after = add(profile(), "free_gain", y, X)

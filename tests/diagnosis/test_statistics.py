@@ -13,7 +13,7 @@ from edgefilter.diagnosis.diagnose import conclude
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.result import Known, Precision
 from edgefilter.diagnosis.select import search
-from edgefilter.diagnosis.trials import Workbench
+from edgefilter.diagnosis.trials import Found, Workbench
 from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.measurement import Measurement
 from edgefilter.report.text import candidate_lines, diagnosis_lines, error_text, independence_lines, precision_lines
@@ -75,6 +75,24 @@ def test_the_standard_error_is_the_scatter_of_fits_to_other_noise(diagnosed):
         other = Measurement(prepared.measurement.reference, noisy, prepared.noise_psd, prepared.fit)
         fits.append(effect.fit(other, robot.echo)["gain_db"])
     assert 0.5 < known.error / np.std(fits, ddof=1) < 2.0
+
+
+def test_an_interval_holds_the_truth_in_nine_of_ten_recordings():
+    """At least 85 % of 24 intervals; a ring's fit ends short of the least error, and a clipper's thirds were all alike: 17 of 24 did."""
+    held = []
+    for effect, truth in {
+        "chassis_resonance": {"frequency_hz": 640.0, "q": 35.0, "gain_db": -2.0},
+        "mic_clipping": {"level": 0.06},
+    }.items():
+        for seed in range(6):
+            x, robot = voice(12.0, seed), profile()
+            prepared = prepare(robot, record(x, robot.echo.with_effect(effect, truth), seed=100 + seed), x)
+            bench = Workbench(prepared, Criteria())
+            step = bench.attempt(effect, prepared.model)
+            found = Found(prepared, prepared.model, step.model, bench.score(prepared.model), step.score, (step,))
+            known = conclude(prepared, found, Criteria()).ranking[0].parameters
+            held += [known[name].low <= value <= known[name].high for name, value in truth.items()]
+    assert np.mean(held) >= 0.85 and len(held) == 24
 
 
 def test_the_text_says_all_of_it(diagnosed):
