@@ -27,6 +27,7 @@ def findings_of(found: Found, intervals: Mapping[str, Mapping[str, Interval]]) -
     for step in found.steps:
         without_db = found.recording.of(less(found.start, found.model, step.name)).level_db
         after = found.final.excess_db if step is found.steps[-1] else step.score.excess_db
+        otherwise = f"with {step.name} the held-out residual falls by {step.gain_db:.2f} dB"
         findings.append(
             Finding(
                 effect=step.name,
@@ -36,12 +37,7 @@ def findings_of(found: Found, intervals: Mapping[str, Mapping[str, Interval]]) -
                 excess_after_db=after,
                 share=max(share_of(found.base.excess_db, after) - share_of(found.base.excess_db, before), 0.0),
                 parameters=intervals.get(step.name, {}),
-                evidence=evidence_of(
-                    step.name,
-                    step.values,
-                    found.start,
-                    f"with {step.name} the held-out residual falls by {step.gain_db:.2f} dB",
-                ),
+                evidence=evidence_of(step.name, step.values, found.start, otherwise),
                 values=step.values,
                 prediction=step.score.prediction,
                 like=found.like.get(step.name),

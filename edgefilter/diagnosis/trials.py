@@ -237,14 +237,14 @@ class Workbench:
         if AHEAD in has or not filters:
             return None
         ahead = self.attempt(AHEAD, reduce(self.less, filters, model))
-        room = next((name for name in filters if find(name).stage == "response"), None)
-        again = self.attempt(room, ahead.model) if ahead and room else ahead
-        return again.model if again else None
+        if ahead and (room := next((name for name in filters if find(name).stage == "response"), None)):
+            ahead = self.attempt(room, ahead.model)
+        return ahead.model if ahead else None
 
     def known_by(self, law: Trial) -> Reading | None:
         """The listed filter on the path that explains most of what a law's filter does by itself."""
         start = self._start
-        listed = [one for one in names() if _on_path(one) and not find(one).free]
+        listed = [name for name in names() if (one := find(name)).stage == "path" and one.absorbed and not one.free]
         best = max(
             (fit for one in listed if (fit := self.attempt(one, start))), key=lambda fit: fit.gain_db, default=None
         )
@@ -323,11 +323,6 @@ def added(start: EchoModel, model: EchoModel) -> list[str]:
     """Names of the effects that a model has beyond the start it was made from, or at other values, the latest last."""
     known = dict(start.effects)
     return [name for name, values in model.effects if known.get(name) is not values]
-
-
-def _on_path(name: str) -> bool:
-    """Whether an effect is a filter behind the loudspeaker, which a linear path holds as well."""
-    return find(name).stage == "path" and find(name).absorbed
 
 
 def noisy(model: EchoModel) -> bool:
