@@ -18,7 +18,7 @@ from edgefilter.errors import UsageError
 from edgefilter.types import Array
 
 MOST = 8
-"""Numbers of one parameter that are told: more are a curve."""
+"""Numbers of one parameter that are told, and moved: more are a curve or a filter."""
 STEP = 1e-3
 """Of a number, by which it is moved to see what the prediction makes of it: float32 holds it to a ten-thousandth of that."""
 TOLD = 0.1
@@ -53,8 +53,8 @@ def precision(
     From the derivatives of the model's prediction. Sandwich estimate (White 1980; Liang & Zeger 1986) on the samples that were
     fitted to, blocks of half a second standing for what is independent: speech and fan are neither white nor stationary. A fit may end
     short of the least error, by more than chance moves that: the interval reaches from the value to where a Gauss-Newton step would
-    lead (Le Cam 1956, the one-step estimator), and beyond both by chance. Filters of many taps stay as they are; numbers that are read off
-    them move nothing, and have the scatter of fits to a third of the recording each.
+    lead (Le Cam 1956, the one-step estimator), and beyond both by chance. An effect that has a filter of many taps as well, or a number
+    that moves nothing since it is read off, has the scatter of fits to a third of the recording each.
     """
     told = [(step, parameter) for step in found.steps for parameter in find(step.name).told]
     sizes = [np.size(step.values[parameter.name]) for step, parameter in told]
@@ -63,7 +63,8 @@ def precision(
     spreads: dict[int, Spread] = {
         i: (None, "at its bound", 0.0, 0.0) for i, n in enumerate(numbers) if n.value in ends[i]
     }
-    free = (i for i in range(len(numbers)) if i not in spreads)
+    few = {step.name: max(map(np.size, step.values.values()), default=0) <= MOST for step in found.steps}
+    free = (i for i, number in enumerate(numbers) if i not in spreads and few[number.step.name])
     moved = {i: x for i in free if (x := _derivative(found, numbers[i])) is not None}
     shared = []
     if solved := _solved(found, np.stack(list(moved.values()))) if moved else None:
