@@ -1,4 +1,4 @@
-"""What the robot sounds like at the microphone: level and colour, by which it is known again when no reference tells of it."""
+"""What the robot sounds like at the microphone: the shape of its spectrum, by which it is known again without a reference."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from edgefilter.dsp.psd import mel_edges
 from edgefilter.filter.volume import AUDIBLE
 from edgefilter.types import SAMPLE_RATE, Samples
 
-BANDS, LOWEST_HZ = 20, 100.0
-"""Bands as wide as the ear's (mel), and where the lowest begins."""
+BANDS, LOWEST_HZ = 40, 100.0
+"""Half as wide as the ear's bands (mel), and where the lowest begins. With 20 bands 25 times as many humans pass."""
 HEARD_S = 4.0
 """Seconds of robot from which on its sound is known, and of another sound that are compared with it."""
 MEMORY_S = 20.0
 """Seconds of robot over which its sound is averaged."""
 NOISY = 4.0
 """Power over the noise's, 6 dB, from which on a band is compared."""
-ALIKE_DB = 4.5
-"""Root mean square, over the bands, of the difference in level below which a sound is taken for the robot. On 18 real devices
-8 of 10 stretches of 4 s of robot differ by less from the others; of 108 of humans who were brought to the robot's level
-none does (least 5.0 dB)."""
+ALIKE_DB = 3.7
+"""Standard deviation over the bands of the difference in level, below which a sound is taken for the robot, however loud it is. On
+25 real devices 2 of 3 stretches of 4 s of robot differ by less from the others. Of 664 stretches of humans 5.7 % are below 5.4 dB
+and one is below 4.4 dB, so that one in some 8000 is expected below this."""
 
 
 class RobotSound:
@@ -59,4 +59,4 @@ class RobotSound:
         self.forget()
         compared = np.maximum(other, self._robot) > NOISY * floor
         level_db = 10.0 * np.log10((other + floor) / (self._robot + floor + 1e-30))
-        return bool(compared.any() and np.sqrt(np.mean(np.square(level_db[compared]))) < ALIKE_DB)
+        return bool(compared.any() and level_db[compared].std() < ALIKE_DB)

@@ -1,11 +1,13 @@
-"""By level and colour the robot is known again without a reference, and nobody else is taken for it."""
+"""The robot is known again by the shape of its spectrum, without a reference, and nobody else is taken for it."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from edgefilter.filter.robot_sound import RobotSound
+from edgefilter.filter.robot_sound import ALIKE_DB, HEARD_S, RobotSound
 
 HOP, BINS = 256, 257
 HOPS = 16000 / HOP
@@ -28,17 +30,26 @@ def heard(other: np.ndarray, known_s: float = 10.0, noise: np.ndarray = NOTHING)
     return [said for power in other if (said := robot.compare(power, noise)) is not None]
 
 
-def test_the_robot_is_known_again_every_four_seconds_and_a_voice_of_another_level_or_colour_is_not() -> None:
+def shape(rng: np.random.Generator, spread_db: float) -> np.ndarray:
+    """Power (BINS,) whose level has this standard deviation, dB, and wanders no faster over frequency than a band is wide."""
+    knots = np.interp(np.linspace(0.0, 1.0, BINS), np.linspace(0.0, 1.0, 60) ** 2, rng.standard_normal(60))
+    return 10.0 ** (spread_db * (knots - knots.mean()) / knots.std() / 10.0)
+
+
+def test_the_robot_is_known_again_every_four_seconds_and_a_voice_of_another_colour_is_not() -> None:
     assert heard(sound(12.5)) == [True] * 3
-    assert heard(10 ** (-7 / 10) * sound(4.5)) == heard(10 ** (7 / 10) * sound(4.5)) == [False]
     assert heard(sound(4.5, COLOUR * np.where(np.arange(BINS) % 40 < 20, 10.0, 0.1))) == [False]
 
 
-def test_a_robot_that_is_turned_by_3_db_is_still_the_robot() -> None:
-    assert heard(0.5 * sound(4.5)) == heard(2.0 * sound(4.5)) == [True]
+@settings(deadline=None, max_examples=20)
+@given(seed=st.integers(0, 999), level_db=st.floats(-15.0, 30.0))
+def test_the_robot_is_known_at_any_level_and_a_sound_of_another_shape_at_none(seed: int, level_db: float) -> None:
+    rng, gain = np.random.default_rng(seed), 10 ** (level_db / 10)
+    assert heard(gain * sound(4.5, COLOUR * shape(rng, 0.7 * ALIKE_DB))) == [True]
+    assert heard(gain * sound(4.5, COLOUR * shape(rng, 2.0 * ALIKE_DB))) == [False]
 
 
-@pytest.mark.parametrize(("known_s", "said"), [(2.0, []), (5.0, [True])])
+@pytest.mark.parametrize(("known_s", "said"), [(HEARD_S - 1.0, []), (HEARD_S + 1.0, [True])])
 def test_nothing_is_said_before_enough_of_the_robot_was_heard(known_s: float, said: list[bool]) -> None:
     assert heard(sound(4.5), known_s) == said
 
@@ -55,12 +66,19 @@ def test_of_bands_in_the_noise_nothing_is_compared() -> None:
     dull = sound(4.5, COLOUR * np.where(np.arange(BINS) > 100, 0.01, 1.0))
     assert heard(dull) == [False]
     assert heard(dull + fan, noise=fan) == [True]
-    fan = np.where(np.arange(BINS) > 40, 1.0, 1e-6).astype(np.float32)  # nor do they count for those that are heard
-    assert heard(10 ** (-7 / 10) * sound(4.5) + fan, noise=fan) == [False]
+    # nor do they count for those that are heard
+    fan = np.where(np.arange(BINS) > 40, 1.0, 1e-6).astype(np.float32)
+    bent = sound(4.5, COLOUR * np.where(np.arange(BINS) % 20 < 10, 3.0, 1 / 3.0))
+    assert heard(bent + fan, noise=fan) == [False]
+
+
+def test_noise_alone_is_no_robot() -> None:
+    assert not any(heard(sound(4.5), noise=1e3 * COLOUR))
 
 
 def test_the_robot_is_as_it_was_lately() -> None:
     robot = RobotSound(HOP, BINS)
-    for power in (*(100.0 * sound(60.0)), *sound(120.0)):
+    other = COLOUR * shape(np.random.default_rng(3), 8.0)
+    for power in (*sound(60.0, other), *sound(120.0)):
         robot.learn(power)
     assert [said for power in sound(4.5) if (said := robot.compare(power, NOTHING)) is not None] == [True]
