@@ -457,7 +457,7 @@ class Aligner:
         self._gain = before + 0.1 * (min(found.gain, 2 * before) - before)
         was_refuted = self._refuted
         heard_out = self._open and self._ref.end - self._drift.delay > self._open[0].start + STRIDE
-        if self._known and heard_out and abs(found.offset) < DRIFTED:
+        if self._known and heard_out:
             self._resolve()
         return was_refuted or abs(self._drift.delay - step) > 0.5
 

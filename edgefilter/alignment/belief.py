@@ -34,7 +34,9 @@ LOOK = SAMPLE_RATE
 is found in all; with looks of 2 s not in two whose lag changes faster, or whose microphone is processed."""
 JUMP = 0.2
 """Probability that from one look to the next the lag is another: utterances last some 5 s, and each may have its own."""
-CLEAR_DB, LEADS = 0.5, 80
+LEADS = 80
+"""Samples, 5 ms, by which the loudest of a path's arrivals, or one as loud by turns, may be away from the direct sound."""
+CLEAR_DB = 0.5
 """Reverberation after its sound over what is before it, 0.5 to 8 dB in 33 real pairs, tuned on, and as much below zero where they are
 swapped; where a reflection is louder than the direct sound it is the other way round, so a lag of more than LEADS samples is no sign of
 swapped files, and one below -LEADS, as of recorders that are started by hand, is one unless the reverberation clearly comes after."""
@@ -71,27 +73,31 @@ class Belief:
         return int(np.sort(self.certain)[self.certain.size // 2]) if self.certain.size else None
 
     @cached_property
-    def steps(self) -> tuple[Array, Array]:
-        """By how many samples the likely lag has changed, each time that it has, and the odds that lost buffers did it, (k,) each.
+    def steps(self) -> tuple[Array, Array, Array]:
+        """By how many samples the likely lag has changed, each time that it has, and the likelihoods of that, (k,) each.
 
-        A step is one of lost buffers, or as likely as not any other: then a lag anywhere is as likely.
+        They are over that of a lag anywhere, which is as likely as not under either hypothesis: that the loopback loses buffers, and that
+        a path has several arrivals alike, which are the likely one by turns.
         """
         likely = self.probability > 0.5
-        steps, apart = np.diff(self.lags[likely]), np.diff(self.starts[likely])
+        lags, apart = self.lags[likely], np.diff(self.starts[likely])
+        steps, most = np.diff(lags), LOST * np.maximum(apart / LOOK, 1.0)
+        lost = 0.5 + 0.5 * REACH / most * ((steps > 0) & (steps <= most))
+        arrivals = 0.5 + 0.5 * REACH / (2 * LEADS) * (np.abs(lags[1:] - lags[:1]) <= LEADS)
         changed = np.abs(steps) > SAME
-        steps, most = steps[changed], LOST * np.maximum(apart[changed] / LOOK, 1.0)
-        return steps, 0.5 + 0.5 * REACH / most * ((steps > 0) & (steps <= most))
+        return steps[changed], lost[changed], arrivals[changed]
 
     @property
     def lossy(self) -> float:
         """The odds that samples are missing in the reference, over those before anything was heard."""
-        return float(np.prod(self.steps[1]))
+        _, lost, arrivals = self.steps
+        return 2.0 * float(np.prod(lost)) / (1.0 + float(np.prod(arrivals)))
 
     @property
     def lost(self) -> int:
         """Samples that are missing in the reference, by which the lag has grown; 0 unless that is certain."""
-        steps, odds = self.steps
-        return int(steps[odds > 0.5].sum()) if EARLY_ODDS * self.lossy > CERTAIN else 0
+        steps, lost, _ = self.steps
+        return int(steps[lost > 0.5].sum()) if EARLY_ODDS * self.lossy > CERTAIN else 0
 
     @property
     def missing(self) -> str:

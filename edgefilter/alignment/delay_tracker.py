@@ -35,21 +35,18 @@ exponential tails. So that of a certain jump, 30 or 56, comes about once in 100 
 ONE_LOOK = math.log(CERTAIN * 2 * REACH)
 """Logarithm of the likelihood ratio that one look shows at most, with which a jump within REACH is as good as certain: what is heard in an
 eighth of a second through a microphone that is processed may agree with the reference at any delay."""
-FORGET = 0.7
-"""What is left of a suspicion after a look that saw another jump."""
 HEARD = 6.0
 """Strength of a look's peak over the rms of +-REACH lags from which it counts."""
 FAINT, STRANGE, EDGE = 0.25, 10.0, 64
 """Lower and upper limit of the microphone's power over the expected echo's, outside of which no jump can be measured, and samples
 at each end of the range in which none is believed."""
 DRIFTED = 1.5
-"""Samples of a sudden error up to which it is put down to the drift, buffers that are lost or repeated have more, and within which
-two looks see the same jump."""
-EXPECTED, UNEXPECTED = 3.0, 5.0
-"""Surprise, in standard deviations, up to which an error of up to SMALL samples is drift, and one of up to DRIFTED, and from
-which on a look contradicts what is believed."""
-SLOPE_DEVIATION = 150e-6
-"""Standard deviation of two clocks' difference before anything is known, samples per sample; no difference beyond UNEXPECTED times it is believed."""
+"""Samples within which two looks see the same jump, and up to which that is put down to the drift: buffers that are lost or repeated
+have more."""
+SURPRISING = 3.0
+"""Standard deviations from which on an error contradicts what is believed: up to it one of up to SMALL samples is drift."""
+SLOPE_DEVIATION, STEEPEST = 150e-6, 750e-6
+"""Standard deviation of two clocks' difference before anything is known, samples per sample, and the largest that is believed."""
 BIAS = 0.1
 """Samples by which looks err alike where the response that is supposed explains nothing of the microphone."""
 
@@ -243,7 +240,7 @@ class DriftFilter:
         """Standard deviation of the delay, samples."""
         return math.sqrt(self._variance)
 
-    def restart(self, delay: float, deviation: float = SMALL / EXPECTED) -> None:
+    def restart(self, delay: float, deviation: float = SMALL / SURPRISING) -> None:
         """Another delay, known to +-deviation samples; the slope stays, the clocks are the same. A search finds it to within SMALL."""
         self.delay = delay
         self._variance, self._covariance = deviation**2, 0.0
@@ -253,7 +250,7 @@ class DriftFilter:
     def step(self, found: DelayMeasurement) -> None:
         """The delay is another one by an offset; a small one may come from a wrong slope since the last look as well as from a jump."""
         wrong = found.offset / max(self._since, STRIDE)
-        if abs(found.offset) <= SMALL and abs(self.slope + wrong) < UNEXPECTED * SLOPE_DEVIATION:
+        if abs(found.offset) <= SMALL and abs(self.slope + wrong) < STEEPEST:
             self._slope_variance = min(self._slope_variance + wrong**2, SLOPE_DEVIATION**2)
         self.restart(self.delay + found.offset, math.sqrt(self._noise(found)))
 
@@ -278,7 +275,7 @@ class DriftFilter:
         size, surprise = abs(found.offset), self.surprise(found)
         if found.strength < HEARD:
             return "unseen"
-        if (size < DRIFTED and surprise < UNEXPECTED) or (size < SMALL and surprise < EXPECTED):
+        if size < SMALL and surprise < SURPRISING:
             return "there"
         if found.gain > STRANGE * gain:
             return "drowned"
@@ -289,7 +286,7 @@ class DriftFilter:
     def correct(self, measurement: DelayMeasurement) -> None:
         """Take in a measured offset, which holds for the middle of its frame."""
         noise = self._noise(measurement)
-        if self.surprise(measurement) > UNEXPECTED:  # believe less, but never less than at the start
+        if self.surprise(measurement) > SURPRISING:  # believe less, but never less than at the start
             factor = (measurement.offset**2 - noise) / self._expected()[2]
             factor = max(min(factor, 4.0 / self._variance, SLOPE_DEVIATION**2 / self._slope_variance), 1.0)
             self._variance *= factor
@@ -299,8 +296,7 @@ class DriftFilter:
         spread += noise
         gain = measurement.offset / spread
         self.delay += delay * gain
-        steepest = UNEXPECTED * SLOPE_DEVIATION
-        self.slope = min(max(self.slope + slope * gain, -steepest), steepest)
+        self.slope = min(max(self.slope + slope * gain, -STEEPEST), STEEPEST)
         self._variance -= delay * delay / spread
         self._covariance -= delay * slope / spread
         self._since = 0
@@ -344,12 +340,7 @@ class JumpWitness:
         """Take in a look at which the delay seems to have jumped by its offset; True if that is certain now."""
         shown, size = min(found.evidence / CHANCE, ONE_LOOK), abs(found.offset)
         if abs(found.offset - self._offset) < DRIFTED:
-            self._shown += shown
-        else:
-            self._shown *= FORGET
-            if shown <= self._shown:
-                return False
-            self._shown = shown
-        self._offset = found.offset
+            shown += self._shown
+        self._offset, self._shown = found.offset, shown
         lags = 4 * SMALL + 1 if size <= SMALL else 2 * REACH if size <= REACH else CERTAIN**2 * 6 * REACH
         return self._shown > math.log(CERTAIN * lags)

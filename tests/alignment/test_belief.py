@@ -97,3 +97,11 @@ def test_a_lag_that_grows_again_and_again_is_lost_samples_and_one_that_moves_oth
     assert looks(*range(800, 1000, 5), clearness=2.4).lost == 0  # clocks
     for lags in np.random.default_rng(0).integers(800, 22_000, (20, 12)).tolist():  # each utterance has its own
         assert looks(*lags, clearness=2.4).lost == 0
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_lag_that_wanders_to_and_fro_among_arrivals_alike_is_no_lost_samples(seed):
+    """A path that rings at 680 Hz: its correlation has a peak each 23 samples, all but equal."""
+    arrivals = 2180 + 23 * np.random.default_rng(seed).integers(0, 6, 12)
+    assert looks(*arrivals, clearness=2.4).lost == 0
+    assert looks(*arrivals[:4], *(arrivals[3] + 640 * np.arange(1, 8)), clearness=2.4).lost > 3000

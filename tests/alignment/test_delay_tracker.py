@@ -34,9 +34,9 @@ def seen(found: DelayMeasurement, deviation: float = 0.1, far: bool = False) -> 
 @pytest.mark.parametrize(
     ("deviation", "drift", "jump"),
     [
-        (0.05, 0.75, 0.85),  # 5 standard deviations
+        (0.05, 0.45, 0.52),  # 3 standard deviations
         (0.7, 3.6, 3.8),  # 3 of them, and of a sample that a weak look may be wrong by
-        (0.4, 1.45, 1.55),  # 1.5 samples, beyond 3 of them
+        (0.4, 1.25, 1.35),
         (3.0, 7.9, 8.1),  # 8 samples
     ],
 )
@@ -100,13 +100,13 @@ def test_the_evidence_of_looks_at_the_same_jump_is_added(further, believed):
     assert witness.convinced(look(100.0 + further, 1.0, 0.6 * 30.0)) is believed
 
 
-@pytest.mark.parametrize(("other", "replaced"), [(0.69, False), (0.71, True)])
-def test_a_suspicion_is_replaced_by_another_that_says_more_than_seven_tenths_of_it(other, replaced):
+@pytest.mark.parametrize("other", [0.1, 0.6])
+def test_a_suspicion_is_replaced_by_another(other):
     witness = JumpWitness()
     witness.convinced(look(100.0, 1.0, 0.9 * 30.0))
-    witness.convinced(look(-50.0, 1.0, 0.9 * 30.0 * other))
-    assert witness.convinced(look(-50.0, 1.0, 0.5 * 30.0)) is replaced
-    assert JumpWitness().convinced(look(-50.0, 1.0, 0.5 * 30.0)) is False
+    assert not witness.convinced(look(-50.0, 1.0, other * 30.0))
+    assert not witness.convinced(look(100.0, 1.0, 0.9 * 30.0))
+    assert witness.convinced(look(100.0, 1.0, 0.9 * 30.0))
 
 
 def test_delay_and_drift_are_those_of_a_kalman_filter_with_a_look_at_the_middle_of_its_frame():
@@ -119,7 +119,7 @@ def test_delay_and_drift_are_those_of_a_kalman_filter_with_a_look_at_the_middle_
         state, belief = moved @ state, moved @ belief @ moved.T + hop / STRIDE * np.diag([1e-6, 0.15e-6**2])
         drift.advance(int(hop))
         seen = np.array([1.0, -FRAME / 2])
-        offset = 1.5 * rng.standard_normal() * np.sqrt(seen @ belief @ seen + variance)
+        offset = rng.uniform(-2.99, 2.99) * np.sqrt(seen @ belief @ seen + variance)  # as long as none is surprising
         drift.correct(replace(look(offset, strength=20.0), variance=variance))
         gain = belief @ seen / (seen @ belief @ seen + variance)
         state, belief = state + gain * offset, belief - np.outer(gain, seen @ belief)
