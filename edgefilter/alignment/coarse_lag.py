@@ -24,7 +24,7 @@ ENOUGH_S = 0.75
 simulated ones of validation voices) all are found, half within 0.82 s and nine in ten within 1.46 s. Beside other speech,
 while the reference plays unheard, 2 of 80 pairs of 10 s are believed in once (4 at 0.6 s, none at 1.0): a canceller that
 looks in vain takes nothing away."""
-SAME = 3
+SAME_HOPS = 3
 """Lags on each side, in hops, that are the same arrival."""
 
 
@@ -87,6 +87,8 @@ class CoarseLag:
         at = int(score.argmax())
         alike = self._alike / (self._alike[0] + fourier.TINY)
         left = score - score[at] * np.concatenate((alike[at:0:-1], alike[: score.size - at]))
-        elsewhere = max(left[: max(at - SAME, 0)].max(initial=CHANCE), left[at + SAME + 1 :].max(initial=CHANCE))
+        elsewhere = max(
+            left[: max(at - SAME_HOPS, 0)].max(initial=CHANCE), left[at + SAME_HOPS + 1 :].max(initial=CHANCE)
+        )
         heard = (self._frames - at) * self._hop >= ENOUGH_S * SAMPLE_RATE
         return at * self._hop if heard and score[at] ** 2 > elsewhere else None

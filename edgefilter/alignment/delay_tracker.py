@@ -10,7 +10,7 @@ from scipy.ndimage import uniform_filter1d
 
 from edgefilter.alignment.delay_line import DelayBuffer
 from edgefilter.alignment.lag_search import CERTAIN, NEAR
-from edgefilter.alignment.utterances import FLOOR
+from edgefilter.alignment.utterances import LAST_BIT
 from edgefilter.dsp import fourier
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.lag import climb, turn
@@ -28,14 +28,14 @@ EARLY = (48, 400)
 """Samples before and after the direct sound that the learnt response keeps."""
 SMALL = 8.0
 """Samples of a jump up to which it may also be a wrong slope, and is half as likely as to any other lag within REACH."""
-CHANCE = 2.47
+E_FOLD = 2.47
 """Evidence that makes a jump e times as likely; one beyond REACH is less likely than one within by CERTAIN twice. In 7 minutes of human
 speech, while the reference was played but not heard, looks that agreed had an evidence of up to 19 within REACH and 29 beyond, with
 exponential tails. So that of a certain jump, 30 or 56, comes about once in 100 hours of such speech, beyond REACH once in 50."""
 ONE_LOOK = math.log(CERTAIN * 2 * REACH)
 """Logarithm of the likelihood ratio that one look shows at most, with which a jump within REACH is as good as certain: what is heard in an
 eighth of a second through a microphone that is processed may agree with the reference at any delay."""
-HEARD = 6.0
+COUNTS = 6.0
 """Strength of a look's peak over the rms of +-REACH lags from which it counts."""
 FAINT, STRANGE, EDGE = 0.25, 10.0, 64
 """Lower and upper limit of the microphone's power over the expected echo's, outside of which no jump can be measured, and samples
@@ -122,7 +122,7 @@ class DelayMeter:
         wide[:] = ref.read(start, start + SIZE)
         np.multiply(wide[REACH:-REACH], self._window, out=inner[REACH:-REACH])
         energy, drive = float(x.dot(x)), float(inner.dot(inner))
-        if not (drive > FLOOR and energy > 0.0):
+        if not (drive > LAST_BIT and energy > 0.0):
             return None
         m, a, w = fourier.rfft(self._framed)
         m *= turn(self._omega, centre - whole)
@@ -273,7 +273,7 @@ class DriftFilter:
         "unseen": not at all. "drowned": somebody louder hid it. gain: power that the robot has brought so far.
         """
         size, surprise = abs(found.offset), self.surprise(found)
-        if found.strength < HEARD:
+        if found.strength < COUNTS:
             return "unseen"
         if size < SMALL and surprise < SURPRISING:
             return "there"
@@ -309,7 +309,7 @@ class DriftFilter:
         While the delay is hardly known, a weak look may also have seen another peak than the direct sound's.
         """
         common = BIAS**2 * (1.0 - measurement.explained)
-        doubtful = self._variance > 0.25 and measurement.evidence / CHANCE < ONE_LOOK
+        doubtful = self._variance > 0.25 and measurement.evidence / E_FOLD < ONE_LOOK
         return measurement.variance + common + (1.0 if doubtful else 0.0)
 
     def _expected(self) -> tuple[float, float, float]:
@@ -338,7 +338,7 @@ class JumpWitness:
 
     def convinced(self, found: DelayMeasurement) -> bool:
         """Take in a look at which the delay seems to have jumped by its offset; True if that is certain now."""
-        shown, size = min(found.evidence / CHANCE, ONE_LOOK), abs(found.offset)
+        shown, size = min(found.evidence / E_FOLD, ONE_LOOK), abs(found.offset)
         if abs(found.offset - self._offset) < DRIFTED:
             shown += self._shown
         self._offset, self._shown = found.offset, shown

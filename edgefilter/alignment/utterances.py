@@ -14,7 +14,7 @@ from edgefilter.types import SAMPLE_RATE, AlignmentState, Samples
 PAUSE = SAMPLE_RATE // 5
 """Samples of silence after which the lag may be another one: shorter than any pause between two playbacks, longer than
 a plosive."""
-FLOOR = 2.0**-46
+LAST_BIT = 2.0**-46
 """Mean square of a 24-bit converter's last bit, -138 dB of full scale: a reference that has less is silent."""
 SUSTAINED = 3
 """Hops that a level must last to be the voice's: 48 ms, a short vowel. A click falls into two at most."""
@@ -99,13 +99,13 @@ class OnsetDetector:
         self.now += self._hop
         power = float(ref.dot(ref)) / self._hop
         self.peak = max(self._sustained.step(power), self.peak * self._decay)
-        if power > FLOOR:
+        if power > LAST_BIT:
             # of a hop in which a device begins, or leaves a hole, its noise is in the samples that are there
             softest = power * self._hop / int(np.count_nonzero(ref))
             self.least = min(softest, self.least / self._decay)
         else:
             self._silence = self.now
-        self.active = power > max(FLOOR, SILENT * self.peak)
+        self.active = power > max(LAST_BIT, SILENT * self.peak)
         if not self.active:
             return None
         fresh = self.now - self.current.end > PAUSE
@@ -148,7 +148,7 @@ class Announcements:
 
         Returns False, and queues nothing, if more than MOST_ANNOUNCED utterances or MOST_ANNOUNCED_S seconds would wait.
         """
-        loud = np.flatnonzero(np.abs(utterance) > max(0.01 * float(np.abs(utterance).max(initial=0.0)), FLOOR**0.5))
+        loud = np.flatnonzero(np.abs(utterance) > max(0.01 * float(np.abs(utterance).max(initial=0.0)), LAST_BIT**0.5))
         sound = utterance[max(loud[0] - 256, 0) : loud[-1] + 1] if loud.size else utterance[:0]
         waiting = sum(map(len, (*self._waiting, sound)))
         if len(self._waiting) >= MOST_ANNOUNCED or waiting > MOST_ANNOUNCED_S * SAMPLE_RATE:
@@ -159,7 +159,7 @@ class Announcements:
 
     def reference(self, ref: Samples, now: int) -> Samples:
         """The reference (n,) for the hop that begins at position now: the channel's own, or what is being played."""
-        if (self._waiting or self._playing) and float(ref.dot(ref)) > FLOOR * ref.size:
+        if (self._waiting or self._playing) and float(ref.dot(ref)) > LAST_BIT * ref.size:
             self._waiting.clear()
             self._playing = None
         if self._playing is None:

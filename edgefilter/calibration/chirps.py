@@ -29,7 +29,7 @@ LEAD = round(0.5 * SAMPLE_RATE)
 """Samples of silence before the first chirp, in which the room's noise is measured."""
 QUIET = round(0.1 * SAMPLE_RATE)
 """Samples of it, the quietest of which count: a stream may begin with a noise of its own."""
-CERTAIN = 12.0
+OVER_RMS = 12.0
 """Height of a correlation with the chirps over its root mean square from which they are there: noise has 5."""
 
 
@@ -120,7 +120,7 @@ def _find(heard: Samples, sound: Samples) -> tuple[int, bool]:
     size = fft.next_fast_len(heard.size + sound.size, real=True)
     correlation = np.abs(fft.irfft(flat_cross(sound, heard, size), size))
     at = int(np.argmax(correlation))
-    return at if at < heard.size else at - size, bool(correlation[at] > CERTAIN * np.sqrt(np.mean(correlation**2)))
+    return at if at < heard.size else at - size, bool(correlation[at] > OVER_RMS * np.sqrt(np.mean(correlation**2)))
 
 
 def _slots(x: Samples, starts: np.ndarray, size: int) -> np.ndarray:

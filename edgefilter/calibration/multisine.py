@@ -50,7 +50,7 @@ GROUP = 4
 """Of so many odd lines in a row one, drawn at random, is left out."""
 SMOOTHING_HZ = 30.0
 """Half the width over which lines are averaged at least: 30 lines, so that a density is good to 1 dB."""
-CERTAIN = 3.0
+OVER_CHANCE = 3.0
 """Standard deviations of the noise's own power from which on a distortion is told from it."""
 LEAST_SHARE = 0.1
 """The least share of the recorded power that the loudest multisines must explain; another sound explains none of it."""
@@ -276,7 +276,7 @@ def _approximation(played: Spectra, part: Samples) -> LinearApproximation:
     # standard deviation of a distortion's power where there is noise alone: of the sum over every other line of |line|^2
     # less its expectation, each the mean over all realisations
     chance = np.sqrt(np.sum(noise**2, axis=1) * GRID_HZ[1] * LINE_HZ / 2 / REALISATIONS) / (PERIODS - 1)
-    least = decibels(CERTAIN * chance / np.array([max(total_power(psd), 1e-30) for psd in linear]), 1e-10)
+    least = decibels(OVER_CHANCE * chance / np.array([max(total_power(psd), 1e-30) for psd in linear]), 1e-10)
     densities = {"played": total, "linear": linear, "noise": noise, "even": even, "odd": odd}
     stored = {name: psd.astype(np.float32) for name, psd in densities.items()}
     return LinearApproximation(level_db=level, **stored, least_db=least)

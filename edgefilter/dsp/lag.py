@@ -18,7 +18,7 @@ LOWEST_HZ = 100.0
 ONE_SIGNAL = 0.999
 """Squared correlation coefficient of two signals at lag 0 from which on they are copies of one signal. A microphone's signal
 comes some samples later than its reference, with noise and reverberation above -30 dB, and never correlates so highly."""
-SAME = 0.98
+COPIED = 0.98
 """Correlation of a copy with what it is a copy of, both cut from the same second at a lag of some ms."""
 
 
@@ -114,7 +114,7 @@ def played_in(heard: Samples, played: Samples) -> bool:
     size = fft.next_fast_len(2 * heard.size, real=True)
     cross = fft.irfft(fft.rfft(heard, size) * fft.rfft(played, size).conj(), size)
     whole = np.sqrt(float(np.vdot(heard, heard)) * float(np.vdot(played, played)))
-    return bool(np.abs(cross).max() > SAME * whole > 0.0)
+    return bool(np.abs(cross).max() > COPIED * whole > 0.0)
 
 
 def one_signal(cross: float, first: float, second: float) -> bool:

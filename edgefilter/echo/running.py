@@ -19,7 +19,7 @@ PROBE, ROOM = 2048, 8192
 """Samples of noise on which an effect is tried, and with the silence around it."""
 SHIFTS = (131, 777)
 """Samples by which a filter's input is moved to see its output move along: no rate below 2 kHz has both as periods."""
-SAME = 1e-5
+ALL_BUT_EQUAL = 1e-5
 """Difference, relative in power, up to which two outputs are the same: -50 dB are not heard in what a filter leaves."""
 LONG_MEMORY = SAMPLE_RATE
 """Samples of the past from which an effect with its own way of running begins anew: two releases of a slow compressor."""
@@ -177,4 +177,4 @@ def _probe(seed: int) -> Samples:
 
 def _same(found: Samples, expected: Samples) -> bool:
     difference = found.astype(np.float64) - expected
-    return float(difference @ difference) <= SAME * float(np.sum(expected.astype(np.float64) ** 2))
+    return float(difference @ difference) <= ALL_BUT_EQUAL * float(np.sum(expected.astype(np.float64) ** 2))

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edgefilter.alignment.utterances import FLOOR, Sustained
+from edgefilter.alignment.utterances import LAST_BIT, Sustained
 from edgefilter.dsp import fourier
 from edgefilter.dsp.membrane import DISPLACEMENT_TAPS, displacement_taps
 from edgefilter.dsp.shelf import Shelf, ShelfState
@@ -182,7 +182,7 @@ class Canceller:
         self._all_spectra = np.zeros((2 * rows, bins), np.complex64)
         self._all_powers = np.zeros((2 * rows, bins), np.float32)
         self._moving = np.zeros(DISPLACEMENT_TAPS - 1, np.float32)
-        self._loudest, self._sustained = FLOOR, Sustained()
+        self._loudest, self._sustained = LAST_BIT, Sustained()
         self._begin()
         self._slide(to=rows)
 
@@ -244,7 +244,7 @@ class Canceller:
         self._noise *= memory
         self._noise += (1.0 - memory) * fourier.power(error_spectrum)
         self._hops += 1
-        talks = np.vdot(self._played[0], self._played[0]) > FLOOR * self.hop
+        talks = np.vdot(self._played[0], self._played[0]) > LAST_BIT * self.hop
         if self._silent and not talks:
             self._before = self._noise.copy()
         self._silent = self._silent and not talks

@@ -8,8 +8,8 @@ from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 TONES_HZ = (50.0, 100.0, 150.0, 200.0, 60.0, 120.0, 180.0, 240.0)
 """The mains of all countries, and what rectifiers and transformers make of them."""
-NOTCH_HZ, LEAST = 2.0, 0.01
-"""Width of the notch at a tone, Hz: it is in place half a second later. LEAST: power of a tone that is taken off, relative to
+NOTCH_HZ, FAINTEST = 2.0, 0.01
+"""Width of the notch at a tone, Hz: it is in place half a second later. FAINTEST: power of a tone that is taken off, relative to
 the loudest."""
 
 
@@ -49,7 +49,7 @@ class Hum:
         hops = self._hops - self._second // 2
         turned = np.sum((self._tones * np.conj(self._before * self._hop_turn**hops)).reshape(-1, len(TONES_HZ)), axis=0)
         self._tune(np.array(TONES_HZ) + np.angle(turned) / (2.0 * np.pi * hops * self._hop / SAMPLE_RATE))
-        self._waves[np.abs(turned) < LEAST * np.abs(turned).max()] = 0.0
+        self._waves[np.abs(turned) < FAINTEST * np.abs(turned).max()] = 0.0
 
     def _tune(self, hz: Array) -> None:
         turns = 2j * np.pi * hz / SAMPLE_RATE

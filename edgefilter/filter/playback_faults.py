@@ -24,7 +24,7 @@ the highest 1 % reach .34, the highest of all .56. Of 22 real recordings played 
 FRAME, HOP = 2048, 512
 BINS_HZ = 200.0 * np.exp(STEP * np.arange(340))
 """Up to 6 kHz."""
-FORMANTS, FLOOR = 30, 1e-5
+FORMANTS, RANGE = 30, 1e-5
 """Bins of the moving mean that is subtracted from the logarithm of a spectrum, so that harmonics are left; power of the floor, relative
 to the loudest bin."""
 ASIDE = 8
@@ -85,7 +85,7 @@ def _harmonics(x: Samples) -> Samples:
     """Logarithm of each frame's spectrum, less its envelope over frequency and less each bin's mean over time, (frames, bins)."""
     power = fourier.power(fourier.rfft(frames(x, FRAME, HOP) * hann(FRAME).astype(np.float32)))
     read = _between(power.T, BINS_HZ * FRAME / SAMPLE_RATE).T
-    found = np.log(read + np.float32(FLOOR) * read.max() + fourier.TINY)
+    found = np.log(read + np.float32(RANGE) * read.max() + fourier.TINY)
     found -= uniform_filter1d(found, FORMANTS, axis=1)
     found -= found.mean(axis=0)
     loudness = power.sum(axis=1)

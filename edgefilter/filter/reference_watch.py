@@ -13,7 +13,7 @@ import numpy as np
 from edgefilter.alignment.aligner import FIRST_LOOK, LOOKS, Aligned, Past
 from edgefilter.alignment.belief import LOOK, Belief
 from edgefilter.alignment.lag_search import CERTAIN, MOST_LAG_S
-from edgefilter.alignment.utterances import FLOOR, VARIES, Sustained
+from edgefilter.alignment.utterances import LAST_BIT, VARIES, Sustained
 from edgefilter.dsp import fourier
 from edgefilter.dsp.lag import one_signal
 from edgefilter.filter.microphones import SILENT
@@ -26,7 +26,7 @@ from edgefilter.types import SAMPLE_RATE, EventKind, Frame, Samples
 OTHERS = 0.2
 """Share of the looks in which the microphone hears something where the robot plays unheard, into headphones, say: people take turns with
 it; and of those in which it hears nothing where a sound is played."""
-MISSING, HEARD = 60 * SAMPLE_RATE, 10 * SAMPLE_RATE
+NONE_CAME, SOUNDED = 60 * SAMPLE_RATE, 10 * SAMPLE_RATE
 """Samples without any reference, of which so many were not silent at the microphone, SILENT of full scale: a level of the
 converter, since there is nothing else to compare with. 16 bits by themselves are 41 dB softer."""
 FELL_SILENT = 1e-3
@@ -100,7 +100,7 @@ class ReferenceWatch:
         self._idle = aligned.state in ("idle", "announced")  # announced speech is no reference before its echo is heard
         power, played = float(mic.dot(mic)) / self._hop, float(ref.dot(ref)) / self._hop
         self._loudest = max(self._loudest, self._sustained.step(power))
-        if power > FLOOR:
+        if power > LAST_BIT:
             self._least = min(power, self._rise * self._least)
         checks: tuple[tuple[EventKind, str], ...] = (
             ("reference_late", self._late_by(aligned.belief, aligned.past)),
@@ -174,7 +174,7 @@ class ReferenceWatch:
     def _same(self, mic: Samples, ref: Samples) -> str:
         """Add up products of both channels until they hold enough sound to tell whether they are one signal."""
         products = float(mic.dot(ref)), float(mic.dot(mic)), float(ref.dot(ref))
-        if min(products[1:]) > FLOOR * self._hop:
+        if min(products[1:]) > LAST_BIT * self._hop:
             self._products += products
             self._sounding += self._hop
         if self._sounding < SAME_S * SAMPLE_RATE:
@@ -264,12 +264,12 @@ class ReferenceWatch:
 
     def _wait_for_any(self, power: float, played: float) -> str:
         """Count what is heard while no reference ever came."""
-        self._ever = self._ever or played > FLOOR
+        self._ever = self._ever or played > LAST_BIT
         if self._ever:
             return ""
         self._silent += self._hop
         self._heard += self._hop if power > SILENT else 0
-        if self._silent < MISSING or self._heard < HEARD or not self._once("missing"):
+        if self._silent < NONE_CAME or self._heard < SOUNDED or not self._once("missing"):
             return ""
         return (
             f"the reference has been silent for {self._silent / SAMPLE_RATE:.0f} s, since the start: if the robot has"

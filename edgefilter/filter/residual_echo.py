@@ -20,7 +20,7 @@ LEAKAGE_MEMORY, STEPS = 0.97, (0.9, 1.005)
 once and rises by 1.4 dB a second, so that a human's sentence hardly lifts it."""
 MARGIN = 3.0
 """Leakage over what is tracked: a mask needs that of loud moments, which distort most, and quiet ones are tracked."""
-AUDIBLE = 60.0
+OVER_NOISE = 60.0
 """Power of the echo over the noise's, 18 dB, from which on its leakage can be told from the noise."""
 SPREAD, SPREAD_HZ = 0.1, 2000.0
 """Distortion falls on other frequencies too: this part of the echo's mean over SPREAD_HZ counts as well."""
@@ -136,12 +136,12 @@ class Residual:
         if added is not None:
             unknown += added
         loud = float(np.add.reduce(brought))
-        if loud > AUDIBLE * noise_power:
+        if loud > OVER_NOISE * noise_power:
             self._track(float(np.vdot(error, error).real) - noise_power - float(np.add.reduce(unknown)), loud)
         brought *= self._leakage
         brought += unknown
         self._loudest = max(loud, WITH_VOICE_HELD * self._loudest)
-        if self.nobody_speaks and self._loudest > AUDIBLE * noise_power:
+        if self.nobody_speaks and self._loudest > OVER_NOISE * noise_power:
             self._follow(observed - noise - brought)
         brought += np.float32(WITH_VOICE_MARGIN * self._loudest) * np.maximum(self.with_voice, np.float32(0.0))
         return noise, brought

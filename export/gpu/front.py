@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool1d, pad
 
-from edgefilter.alignment.utterances import FLOOR, SUSTAINED
+from edgefilter.alignment.utterances import LAST_BIT, SUSTAINED
 from edgefilter.dsp import fourier
 from edgefilter.dsp.membrane import displacement_taps
 from edgefilter.dsp.shelf import Shelf
@@ -60,7 +60,7 @@ def cancel(
     heard = convolved(mic, lowered).view(batch, hops, hop)
     past, scales = _references(reference, hop, adaptation.products, lowered, partitions)
     rows = partitions + c.PRODUCT_PARTITIONS * (len(past) - 1)
-    talks = reference.view(batch, hops, hop).square().sum(-1) > FLOOR * hop
+    talks = reference.view(batch, hops, hop).square().sum(-1) > LAST_BIT * hop
     first = torch.zeros(batch, rows, 2 * hop, device=device)
     if path is not None:
         known = pad(path[:, : partitions * hop], (0, max(0, partitions * hop - path.shape[1])))
@@ -144,7 +144,7 @@ def _references(
     channels, scales = [reference], []
     if products:
         loudness = pad(reference.view(batch, hops, hop).square().mean(-1), (SUSTAINED - 1, 0))
-        loudest = loudness.unfold(1, SUSTAINED, 1).amin(-1).clamp(min=FLOOR).cummax(1)[0].sqrt()
+        loudest = loudness.unfold(1, SUSTAINED, 1).amin(-1).clamp(min=LAST_BIT).cummax(1)[0].sqrt()
         size = loudest.repeat_interleave(hop, 1)
         low_pass = torch.from_numpy((displacement_taps() / c.DISPLACEMENT_SCALE).astype(np.float32)).to(reference)
         moved = size * (convolved(reference, low_pass) / size).clamp(-c.FURTHEST, c.FURTHEST)
@@ -256,7 +256,7 @@ def expected_powers(
         spread = held + r.SPREAD * around
         unknown = misalignment * uncertainty[:, t]
         loud = spread.sum(1, keepdim=True)
-        audible = loud > r.AUDIBLE * total
+        audible = loud > r.OVER_NOISE * total
         excess = now.sum(1, keepdim=True) - total - unknown.sum(1, keepdim=True)
         part = 1.0 - r.LEAKAGE_MEMORY
         left = torch.where(audible, left + part * (excess - left), left)
