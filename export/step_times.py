@@ -15,7 +15,7 @@ WARM, TIMED = 3, 8
 
 
 def table(task: Task, batches: Batches) -> str:
-    """Milliseconds of a batch on the data's thread, which runs meanwhile, and torch's table of a step's operations on untrained weights."""
+    """Milliseconds that the loading thread needs for a batch beside the training, and torch's table of a step's operations."""
     network = task.network()
     tools = optimisers(network, 1e-3)
     began = time.perf_counter()

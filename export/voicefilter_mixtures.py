@@ -110,7 +110,7 @@ class Mixtures:
         return self.spectra(*(np.stack(each) for each in zip(*rows, strict=True)))
 
     def refresh(self) -> int:
-        """How many items there are; none is added to those that were read."""
+        """Number of items; it does not change after they were read."""
         return len(self.items)
 
     def whole(self, item: Item, seconds: float, teller: Item | None = None) -> dict[str, Tensor]:

@@ -24,7 +24,7 @@ class VoiceFilterTask:
 
     def __init__(self, config: VoiceFilterConfig, half: bool = True) -> None:
         self._config, self.stft = config, config.stft
-        # a processor without AVX-512 has no such LSTM
+        # torch has a bfloat16 LSTM only for processors with AVX-512
         self._half = half and torch.ops.mkldnn._is_mkldnn_bf16_supported()
 
     def network(self) -> VoiceFilter:
@@ -37,7 +37,7 @@ class VoiceFilterTask:
         return f"VoiceFilter, {parameter_count(network)} parameters"
 
     def loss(self, network: nn.Module, batch: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:
-        """Difference of power-law compressed magnitudes, and the estimate, scaled as the batch is."""
+        """Loss of power-law compressed magnitudes ("total") and SI-SDR, and the estimate at the batch's level."""
         magnitude = batch["mic"].norm(dim=-1)
         with torch.autocast("cpu", torch.bfloat16, enabled=self._half and network.training):
             mask = network(magnitude, batch["d_vector"]).float()

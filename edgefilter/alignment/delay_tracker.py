@@ -41,12 +41,13 @@ FAINT, STRANGE, EDGE = 0.25, 10.0, 64
 """Lower and upper limit of the microphone's power over the expected echo's, outside of which no jump can be measured, and samples
 at each end of the range in which none is believed."""
 DRIFTED = 1.5
-"""Samples within which two looks see the same jump, and up to which that is put down to the drift: buffers that are lost or repeated
-have more."""
+"""Samples. Two measurements that differ by less show the same jump; a jump of less is attributed to the clocks' drift, since a lost or
+repeated buffer makes a larger one."""
 SURPRISING = 3.0
-"""Standard deviations from which on an error contradicts what is believed: up to it one of up to SMALL samples is drift."""
+"""Standard deviations. A larger error contradicts the estimated delay; a smaller one, if it is less than SMALL samples, is drift."""
 SLOPE_DEVIATION, STEEPEST = 150e-6, 750e-6
-"""Standard deviation of two clocks' difference before anything is known, samples per sample, and the largest that is believed."""
+"""Difference of the clocks of playback and capture, samples per sample: standard deviation before anything is heard, and the largest
+difference that is accepted."""
 BIAS = 0.1
 """Samples by which looks err alike where the response that is supposed explains nothing of the microphone."""
 

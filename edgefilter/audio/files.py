@@ -74,7 +74,7 @@ def make_folder(folder: Path, purpose: str) -> None:
 
 @contextmanager
 def whole(path: str | Path, what: str) -> Iterator[BinaryIO]:
-    """A file to write, of which no part is left where the writing fails or is interrupted; AudioFileError says what it was to be."""
+    """A file to write, of which no part is left where the writing fails or is interrupted. what: its kind, which AudioFileError names."""
     try:
         file = open(path, "wb")  # noqa: SIM115
         try:

@@ -18,10 +18,10 @@ HELD = "; the profile holds this effect with other values"
 
 
 def findings_of(found: Found, intervals: Mapping[str, Mapping[str, Interval]]) -> tuple[Finding, ...]:
-    """The findings, the one that is missed most first; intervals: of their parameters, by effect.
+    """The findings, the effect without which most is left first; intervals: of their parameters, by effect.
 
-    Each has the excess before and after it in the order of the steps. A change of the fan comes first only where it is
-    more than all the rest.
+    Each has the excess over the fan before and after its effect was added. A change of the fan's noise comes first only where it
+    explains more than all other findings together.
     """
     findings, before = [], found.base.excess_db
     for step in found.steps:

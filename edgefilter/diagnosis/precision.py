@@ -18,9 +18,9 @@ from edgefilter.errors import UsageError
 from edgefilter.types import Array
 
 MOST = 8
-"""Numbers of one parameter that are told, and moved: more are a curve or a filter."""
+"""A parameter of more numbers is a curve or a filter, of which no number has an interval."""
 STEP = 1e-3
-"""Of a number, by which it is moved to see what the prediction makes of it: float32 holds it to a ten-thousandth of that."""
+"""Relative step of the numerical derivatives: the share of a number by which it is changed. Rounding to float32 is a ten-thousandth of it."""
 TOLD = 0.1
 """Correlation from which on it is told: less widens neither error by more than 0.5 %."""
 T = 1.7
@@ -29,11 +29,11 @@ of 3, that with 2: of three fits to a third each."""
 
 
 Spread: TypeAlias = tuple[float | None, Source, float, float]
-"""Of a number: standard error, where that is from, and how far below and above it the 90 % interval ends."""
+"""How well a number is known: its standard error, the method that gave it, and how far below and above it the 90 % interval ends."""
 
 
 class Number(NamedTuple):
-    """One number of a step of the search: of that parameter, at that place in it."""
+    """One fitted number: the step of the search that added its effect, the parameter, and the index in that parameter."""
 
     step: Trial
     parameter: Parameter
@@ -149,7 +149,7 @@ def _thirds(found: Found, step: Trial, doubts: list[str]) -> list[Values]:
 
 
 def _scatter(number: Number, fits: list[Values]) -> Spread:
-    """From the scatter of fits and from how far their mean is off: a number is known no better than that. Anywhere where fewer than two were made."""
+    """The interval from the scatter of fits to thirds and how far their mean is from the fitted number; infinite for fewer than two fits."""
     if len(fits) < 2:
         return None, "none", np.inf, np.inf
     alike = [np.asarray(fit[number.parameter.name], float) for fit in fits]

@@ -73,9 +73,10 @@ def forward(bench: Workbench, start: EchoModel, model: EchoModel) -> Trial | Non
 
 
 def _behind_a_filter(bench: Workbench, start: EchoModel, model: EchoModel) -> Iterator[Trial]:
-    """The filter of a model moved ahead of the loudspeaker, alone and with a nonlinear loudspeaker behind it.
+    """Two kinds of trial: the model's filter moved ahead of the loudspeaker, and that with a nonlinear loudspeaker behind it.
 
-    Which of the two comes first shows in the products alone. So all are fitted in turn before they are judged.
+    Which of filter and loudspeaker comes first shows only in the distortion products. So all effects of a trial are refitted before
+    it is judged.
     """
     moved, before = bench.filtered_ahead(model), bench.score(model)
     if moved is None:
@@ -89,7 +90,10 @@ def _behind_a_filter(bench: Workbench, start: EchoModel, model: EchoModel) -> It
 
 
 def refit(bench: Workbench, start: EchoModel, model: EchoModel) -> EchoModel:
-    """Each effect beyond start fitted beside the others, in turn, as long as a round of that lowers the held-out level: one fit may raise it."""
+    """Refit each effect that was added to start, in turn, while the others stay as they are (backfitting).
+
+    Rounds go on as long as a whole round lowers the held-out level; a single fit in it may raise that.
+    """
     listed, worth = added(start, model), bench.criteria.worth_db
     if len(listed) < 2:
         return model

@@ -231,7 +231,7 @@ class Workbench:
         return [trial for trial in resorts if trial is not None]
 
     def filtered_ahead(self, model: EchoModel) -> EchoModel | None:
-        """The model with one filter ahead of the loudspeaker for those of the echo path; the room is fitted anew. None if it has no such filter."""
+        """The model in which one filter ahead of the loudspeaker replaces those behind it; the room is refitted. None if no filter is behind it."""
         has = added(self._start, model)
         filters = [name for name in has if find(name).absorbed and find(name).stage != "source"]
         if AHEAD in has or not filters:

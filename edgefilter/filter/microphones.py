@@ -17,8 +17,8 @@ was 12 to 18 dB louder (a real robot's noise on four microphones)."""
 SILENT = 1e-6
 """Power, -60 dB, below which a microphone is called silent and not soft, over the loudest one's."""
 UNLIKE, LEFT = 10.0, 0.3
-"""How many times as much of the robot is left in a microphone whose path is another than was calibrated, swapped, broken, or
-processed, as in the best one; and the least of it, over the microphone's power."""
+"""A microphone is swapped, broken or processed if more of the robot is left in it than UNLIKE times what is left in the best one, and
+than LEFT of its own power."""
 CLIPPED_DB, MOST_CLIPPED = -0.1, 16
 """Size from which a sample counts as clipped, dB of full scale: conversion to 16 kHz may lower a clipped peak a little; so
 many, 1 ms of them in a block, are no single peak."""

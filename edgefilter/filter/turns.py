@@ -49,7 +49,8 @@ class Turns:
         else:
             self._errors[at] = errors
             gain = np.divide(answer, error, out=np.zeros_like(answer), where=error != 0.0)
-            self._gains[at] = gain / np.maximum(np.abs(gain), 1.0)  # engines add no sound, but an error can vanish
+            # an engine's output is no louder than its input, but where that is all but zero their ratio may say so
+            self._gains[at] = gain / np.maximum(np.abs(gain), 1.0)
         self._count += 1
 
     def start(self, waited: int = 0) -> None:
@@ -74,7 +75,7 @@ class Turns:
         else:
             spectra = sum(weight.conj() * errors[:, at] for at, weight in enumerate(self._spatial.finished())) * gains
         late = self._stft.window_length - self._stft.hop
-        # frame t ends with sample (t + 1) hop; the first and the last late samples lack a frame
+        # frame t ends with sample (t + 1) hop; the first `late` samples lack the frame before, the last `late` the one after
         return Turn(first * self._stft.hop, overlap_add(spectra, self._stft)[late : -late or None])
 
     def _grow(self) -> None:
