@@ -13,7 +13,7 @@ BANDS, LOWEST_HZ = 40, 100.0
 HEARD_S = 4.0
 """Seconds of robot from which on its sound is known, and of another sound that are compared with it."""
 MEMORY_S = 20.0
-"""Seconds of robot over which its sound is averaged."""
+"""Seconds of robot, and of another sound, over which either is averaged."""
 NOISY = 4.0
 """Power over the noise's, 6 dB, from which on a band is compared."""
 ALIKE_DB = 3.7
@@ -36,7 +36,7 @@ class RobotSound:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew with what is heard."""
+        """The reference plays: what is heard without it begins anew."""
         self._other, self._count = np.zeros(self._edges.size), 0
 
     def learn(self, power: Samples) -> None:
@@ -45,18 +45,17 @@ class RobotSound:
         self._robot += (np.add.reduceat(power, self._edges) - self._robot) / min(self._hops, self._most)
 
     def compare(self, power: Samples, noise: Samples) -> bool | None:
-        """Take in a hop without a reference; every HEARD_S of sound whether it is the robot, else None. power, noise: (bins,)."""
+        """Take in a hop without a reference; every HEARD_S of sound whether all since `forget` is the robot, else None. power, noise: (bins,)."""
         if self._hops < self._enough:
             return None
         heard = np.add.reduceat(power, self._edges)
         if heard.sum() < AUDIBLE * self._robot.sum():
             return None
-        self._other += heard
         self._count += 1
-        if self._count < self._enough:
+        self._other += (heard - self._other) / min(self._count, self._most)
+        if self._count % self._enough:
             return None
-        other, floor = self._other / self._count, np.add.reduceat(noise, self._edges)
-        self.forget()
+        other, floor = self._other, np.add.reduceat(noise, self._edges)
         compared = np.maximum(other, self._robot) > NOISY * floor
         level_db = 10.0 * np.log10((other + floor) / (self._robot + floor + 1e-30))
         return bool(compared.any() and level_db[compared].std() < ALIKE_DB)

@@ -49,6 +49,13 @@ def test_the_robot_is_known_at_any_level_and_a_sound_of_another_shape_at_none(se
     assert heard(gain * sound(4.5, COLOUR * shape(rng, 2.0 * ALIKE_DB))) == [False]
 
 
+def test_one_sentence_of_an_unusual_colour_makes_nobody_else_of_a_robot_that_was_known() -> None:
+    unusual = COLOUR * shape(np.random.default_rng(4), 1.5 * ALIKE_DB)
+    assert heard(sound(4.5, unusual)) == [False]
+    assert heard(np.concatenate([sound(8.5), sound(4.0, unusual)])) == [True] * 3
+    assert heard(np.concatenate([sound(4.5), sound(60.0, unusual)]))[-1] is False
+
+
 @pytest.mark.parametrize(("known_s", "said"), [(HEARD_S - 1.0, []), (HEARD_S + 1.0, [True])])
 def test_nothing_is_said_before_enough_of_the_robot_was_heard(known_s: float, said: list[bool]) -> None:
     assert heard(sound(4.5), known_s) == said
