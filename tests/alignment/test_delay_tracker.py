@@ -34,9 +34,9 @@ def seen(found: DelayMeasurement, deviation: float = 0.1, far: bool = False) -> 
 @pytest.mark.parametrize(
     ("deviation", "drift", "jump"),
     [
-        (0.05, 0.45, 0.52),  # 3 standard deviations
+        (0.05, 0.75, 0.85),  # 5 standard deviations
         (0.7, 3.6, 3.8),  # 3 of them, and of a sample that a weak look may be wrong by
-        (0.4, 1.25, 1.35),
+        (0.4, 1.45, 1.55),  # 1.5 samples, beyond 3 of them
         (3.0, 7.9, 8.1),  # 8 samples
     ],
 )
@@ -119,7 +119,7 @@ def test_delay_and_drift_are_those_of_a_kalman_filter_with_a_look_at_the_middle_
         state, belief = moved @ state, moved @ belief @ moved.T + hop / STRIDE * np.diag([1e-6, 0.15e-6**2])
         drift.advance(int(hop))
         seen = np.array([1.0, -FRAME / 2])
-        offset = rng.uniform(-2.99, 2.99) * np.sqrt(seen @ belief @ seen + variance)  # as long as none is surprising
+        offset = 1.5 * rng.standard_normal() * np.sqrt(seen @ belief @ seen + variance)
         drift.correct(replace(look(offset, strength=20.0), variance=variance))
         gain = belief @ seen / (seen @ belief @ seen + variance)
         state, belief = state + gain * offset, belief - np.outer(gain, seen @ belief)
