@@ -74,10 +74,11 @@ class Belief:
 
     @cached_property
     def steps(self) -> tuple[Array, Array, Array]:
-        """By how many samples the likely lag has changed, each time that it has, and the likelihoods of that, (k,) each.
+        """By how many samples the likely lag has changed, each time that it has, and two likelihood ratios of each change, (k,) each.
 
-        They are over that of a lag anywhere, which is as likely as not under either hypothesis: that the loopback loses buffers, and that
-        a path has several arrivals alike, which are the likely one by turns.
+        The first is that of a loopback that loses buffers, so that the lag grows; the second that of a path with several arrivals alike, of
+        which now one and now another is found, so that the lag stays within LEADS of the first. Both are against a change to any lag,
+        and either hypothesis leaves half of its probability to that.
         """
         likely = self.probability > 0.5
         lags, apart = self.lags[likely], np.diff(self.starts[likely])

@@ -324,7 +324,7 @@ class DriftFilter:
 
 
 class JumpWitness:
-    """Remembers the most suspicious jump of late, and how much more likely than chance it makes what was seen.
+    """Remembers the jump that the latest looks agree on, and how much more likely than chance it makes what they saw.
 
     >>> look = DelayMeasurement(100.0, 0.01, strength=10.0, ratio=1.6, explained=0.5, gain=1.0, gain_there=1.0)
     >>> witness = JumpWitness()
