@@ -254,9 +254,8 @@ class Stream:
         self.speech_probability = probability
         wait, gain = 0, self.voice_gain
         if probability is not None:
-            suspect = frame.at_any_lag or (self._watch is not None and self._watch.suspect)
             wait = self._watch.wait // self.engine.stft.hop if self._watch else 0
-            self.speech_probability = 0.0 if suspect else probability
+            self.speech_probability = 0.0 if self._watch and self._watch.suspect else probability
         heard = not (frame.idle or frame.at_any_lag)
         if talk := self.barge_in.note(self.speech_probability, wait, self._softer_after(frame, aligned), heard):
             self._tell_of_speech(talk, f"probability {self.speech_probability or 0.0:.2f}")
