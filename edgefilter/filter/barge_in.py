@@ -36,6 +36,8 @@ heard. 124 simulated robots alone (recipe `field`, 25 minutes, closed loop): no 
 8.7; false starts 9 with this bound and without it, 17 without lowering. Of 55 interruptions 51 % are believed within 0.4 s, 29
 without this bound, 60 without lowering. Without a calibration it would give back 3 of the 5 false starts that lowering
 prevents (75 robots), so these robots always wait."""
+QUESTIONS_S = 1.0
+"""Least seconds from one lowering of the voice to the next: a voice that falls more often sounds broken. By definition."""
 
 
 @dataclass(frozen=True)
@@ -98,14 +100,15 @@ class BargeInSettings:
 class OwnVoice:
     """Learns how often a robot is taken for a human, and so which odds tell a human from this one.
 
-    Moments with more than even odds that end without a human are counted while the robot is heard. Their rate has a gamma distribution,
-    a priori that of LEARNED_S of a usual robot (Gelman et al., "Bayesian data analysis", 2.6). hop_s: seconds between two hops.
-    before: what its calibration has counted.
+    Moments with more than even odds that end without a human are counted while the robot is heard, and each further suspicion within
+    such a moment. Their rate has a gamma distribution, a priori that of LEARNED_S of a usual robot (Gelman et al., "Bayesian data
+    analysis", 2.6). hop_s: seconds between two hops. before: what its calibration has counted.
     """
 
     def __init__(self, hop_s: float, before: WhileMoving | None = None) -> None:
         self._hop_s, self._memory, self._usual = hop_s, LEARNED_S / hop_s, LEARNED_S / USUAL_S
         self._even = self._apart = round(BargeInSettings.confirm_s / hop_s)
+        self._open = self._suspected = False
         self._peaks, self._hops = (before.moments, before.seconds / hop_s) if before else (0.0, 0.0)
 
     @property
@@ -122,15 +125,18 @@ class OwnVoice:
         """Take the log-odds of a hop in which nobody is believed to speak. open_: whether somebody is suspected to."""
         forget = 1.0 - 1.0 / self._memory
         self._hops, self._peaks = forget * self._hops + 1.0, forget * self._peaks
+        self._peaks += open_ and self._suspected and not self._open
+        self._open, self._suspected = open_, open_ or self._suspected
         if odds >= 0.0:
             self._even = 0
         elif not open_ or self._even + 1 < self._apart:
             self._even += 1
             self._peaks += self._even == self._apart
+            self._suspected &= self._even < self._apart
 
     def believed(self) -> None:
         """What was heard is a human."""
-        self._even = self._apart
+        self._even, self._open, self._suspected = self._apart, False, False
 
 
 class BargeIn:
@@ -142,7 +148,7 @@ class BargeIn:
     robot lowers its voice meanwhile, those bounds only tell whether anybody speaks, human or robot. It is a human where the sum reaches the
     bound of UNASKED, or where speech goes on once the lower voice is heard at the microphone: from that moment on the sum begins
     anew and never falls below 0 (Page 1954, "Continuous inspection schemes"); if it does not reach the upper bound within
-    the time to confirm, it was the robot.
+    the time to confirm, it was the robot. A suspicion within QUESTIONS_S of such a question asks none, and the sum alone decides.
     hop_s: seconds between two probabilities. settings: None for the defaults. calibrated: whether the robot is, and before: with what
     count of `own`, the rate at which it is taken for a human.
 
@@ -161,6 +167,7 @@ class BargeIn:
         self.settings = settings = settings or BargeInSettings()
         self._pause = max(1, round(settings.min_silence_s / hop_s))
         self._longest = round(settings.confirm_s / hop_s)
+        self._between, self._rest = round(QUESTIONS_S / hop_s), 0
         self.own = OwnVoice(hop_s, before)
         self._threshold = self._needed = log_odds(settings.threshold)
         self._bound, self._sure = log_odds(1.0 - ERROR), log_odds(1.0 - UNASKED) if calibrated else math.inf
@@ -215,12 +222,14 @@ class BargeIn:
 
     def _judge(self, probability: float, wait: int, heard_after: int) -> EventKind | None:
         self._silent = self._silent + 1 if probability < self.settings.release else 0
+        self._rest = max(0, self._rest - 1)
         if not self._hops:
             self._needed = self._threshold + self.own.higher
             if log_odds(probability) < self._needed:
                 return None
         if not self._hops or (self._certain and not self._told and not wait):  # suspected, or the wait is over
-            asked = heard_after if heard_after <= self._longest else 0
+            asked = heard_after if heard_after <= self._longest and not self._rest else 0
+            self._rest = self._between if asked else self._rest
             self._asks, self._anew = asked > 0, self._hops + asked
             self._evidence, self._certain = 0.0, False
         self._hops += 1

@@ -531,5 +531,7 @@ def test_where_the_time_of_a_step_goes(data, network, monkeypatch, capsys, tmp_p
     head, *operations = capsys.readouterr().out.splitlines()
     assert float(head.split(" ms")[0].split()[-1]) > 0 and "2 steps" in head
     steps = {row[0]: row[-1] for line in operations if (row := line.split()) and row[-1].isdigit()}
-    assert "aten::convolution_backward" in steps and any(name.startswith("Optimizer.step") for name in steps)
+    # which of torch's convolutions it is depends on the processor
+    assert any("conv" in name and name.endswith("_backward") for name in steps)
+    assert any(name.startswith("Optimizer.step") for name in steps)
     assert not list(tmp_path.glob("*.pt"))

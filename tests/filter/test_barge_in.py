@@ -128,6 +128,25 @@ def test_a_robot_that_is_often_taken_for_a_human_needs_more_evidence_and_one_tha
         assert (talk.note(0.95, robot=True) == "speech_suspected") is sooner
 
 
+@pytest.mark.parametrize("apart_s", [0.16, 0.24, 0.3, 0.4, 1.0])
+def test_a_robot_that_is_taken_for_a_human_all_the_time_is_learned_as_well_as_one_that_pauses(apart_s):
+    talk, hops = BargeIn(HOP_S), round(apart_s / HOP_S)
+    told = [talk.note(0.05 if i % hops else 0.9995, robot=True) for i in range(round(60 / HOP_S))]
+    assert (
+        told.count("speech_suspected") < 50 and talk.own.higher > 3.0
+    )  # 375 where the moments were one that never ended
+
+
+def test_a_robot_lowers_its_voice_once_in_a_second_at_most():
+    talk, hops = BargeIn(HOP_S), round(0.19 / HOP_S)
+    asking, suspected = [], 0
+    for i in range(round(60 / HOP_S)):
+        suspected += talk.note(0.05 if i % hops else 0.9999, heard_after=5) == "speech_suspected"
+        asking.append(talk.asking)
+    begins = np.flatnonzero(np.diff(np.array(asking, int)) == 1)
+    assert suspected > 2 * begins.size > 60 and np.diff(begins).min() * HOP_S >= 1.0 - HOP_S
+
+
 def test_what_is_believed_to_be_a_human_is_no_mistake_and_nothing_is_learned_while_the_robot_is_silent():
     pause = [UNSURE] * 60
     for said, robot, slower in (([0.9999] * 60, True, False), ([0.9] * 3, False, False), ([0.9] * 3, True, True)):
