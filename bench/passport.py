@@ -42,12 +42,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> str:
-    data = {"RECORDINGS": [options.recordings], "HUMAN": [options.speech]}
-    made_with = provenance.stamp(data, [f"{engine}-uncalibrated" for engine in options.engines])
     found = list(cases(options))
     if not found:
         lacks = f"no recording of a robot alone of {LEAST_S:.0f} s or more"
         raise UsageError(f"{options.recordings} holds {lacks}, expected some")
+    data = {"RECORDINGS": [options.recordings], "HUMAN": [options.speech]}
+    made_with = provenance.stamp(data, [f"{engine}-uncalibrated" for engine in options.engines])
     devices = list(dict.fromkeys(row["device"] for row in found))
     cells, errors = [], []
     for device in devices:

@@ -173,6 +173,6 @@ def test_the_robots_onset_in_the_demo_stays_below_the_human():
         soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0] for name in ("mic", "reference", "human")
     )
     for engine, margin in (("crnn", 0.0), ("ss", 3.0), ("linear", 9.0)):
-        out = enhance(mic, ref, DEMO / "profile.npz", engine=engine)
-        onset = np.abs(out[int(7.8 * RATE) : int(9.0 * RATE)]).max()
+        out = enhance(mic[: 9 * RATE], ref[: 9 * RATE], DEMO / "profile.npz", engine=engine)
+        onset = np.abs(out[int(7.8 * RATE) :]).max()
         assert onset < np.abs(human).max() * 10 ** (margin / 20), engine
