@@ -318,7 +318,8 @@ def tests(copy: Path, chosen: Sequence[str], limit_s: float | None, *options: st
     began = time.monotonic()
     environment = os.environ | {"PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
     for which in ("not slow", "slow"):
-        pytest = "-m pytest --rootdir=. -x -q -p no:cacheprovider -m".split()
+        # hypothesis works without its plugin, which takes 2 s of a processor at each start
+        pytest = "-m pytest --rootdir=. -x -q -p no:cacheprovider -p no:hypothesispytest -m".split()
         left = None if limit_s is None else max(limit_s - (time.monotonic() - began), 1.0)
         command, quiet = [sys.executable, *pytest, which, *options, *chosen], subprocess.DEVNULL
         process = subprocess.Popen(
