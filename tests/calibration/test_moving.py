@@ -85,7 +85,10 @@ def test_the_rate_goes_on_from_what_the_calibration_has_counted():
 
 @pytest.mark.parametrize(
     ("recording", "said"),
-    [(0.01 * np.random.default_rng(0).standard_normal(8 * RATE), SAID[: 8 * RATE]), (ALONE[: 3 * RATE], SAID[: 3 * RATE])],
+    [
+        (0.01 * np.random.default_rng(0).standard_normal(8 * RATE), SAID[: 8 * RATE]),
+        (ALONE[: 3 * RATE], SAID[: 3 * RATE]),
+    ],
 )
 def test_a_robot_that_is_not_heard_is_refused(recording, said):
     with pytest.raises(CalibrationError, match="of the moving robot, expected at least 5: let it talk"):

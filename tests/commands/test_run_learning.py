@@ -15,13 +15,14 @@ from tests.learning.scenes import Scene
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("learning")
     scene = Scene(seconds=8.0)
-    soundfile.write(folder / "mic.wav", scene.mic, SAMPLE_RATE, subtype="FLOAT")
-    soundfile.write(folder / "ref.wav", scene.reference, SAMPLE_RATE, subtype="FLOAT")
+    for name, samples in (("mic", scene.mic), ("ref", scene.reference)):
+        soundfile.write(folder / f"{name}.wav", samples, SAMPLE_RATE, subtype="FLOAT")
+        soundfile.write(folder / f"{name}_short.wav", samples[:SAMPLE_RATE], SAMPLE_RATE, subtype="FLOAT")
     return folder
 
 
-def run(folder, *more):
-    files = ["--input", str(folder / "mic.wav"), "--reference", str(folder / "ref.wav")]
+def run(folder, *more, short=""):
+    files = ["--input", str(folder / f"mic{short}.wav"), "--reference", str(folder / f"ref{short}.wav")]
     outputs = ["--output", str(folder / "out.wav"), "--json", str(folder / "run.json"), "--engine", "linear"]
     code = main(["run", *files, *outputs, "--quiet", *more])
     return code, json.loads((folder / "run.json").read_text()) if code == 0 else None
@@ -36,13 +37,13 @@ def test_what_a_run_learns_is_kept_and_the_next_begins_with_it(folder, capsys):
     assert "learned" in {event["kind"] for event in first["events"]}
     assert "dB less is left of the robot" in capsys.readouterr().err
     assert Profile.load(file).learned
-    code, _ = run(folder, "--learn", str(file))
+    code, _ = run(folder, "--learn", str(file), short="_short")
     assert code == 0
     assert "no profile" not in capsys.readouterr().err
 
 
 def test_without_learning_nothing_is_learned(folder):
-    code, figures = run(folder, "--no-learn")
+    code, figures = run(folder, "--no-learn", short="_short")
     assert code == 0
     assert figures["learning"] is None
 
