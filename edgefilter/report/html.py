@@ -225,12 +225,11 @@ def _facts(before: Comparison, after: Comparison | None, irreducible_db: float |
     facts = [
         ("Unexplained", f"{text.decibels(before.excess_db)} dB", "over the noise floor, with the profile as it is")
     ]
-    if after is not None:
-        facts.append(("With what was found", f"{text.decibels(after.excess_db)} dB", "over the noise floor"))
-    facts.append(("Noise floor", f"{before.noise_floor_db:.1f} dBFS", "the fan, from the calibration"))
     if irreducible_db:
-        facts.append(("Irreducible", f"{text.decibels(irreducible_db)} dB", "that no model can predict"))
-    return facts
+        facts.append(("Left", f"{text.decibels(irreducible_db)} dB", f"over the fan: {text.IRREDUCIBLE}"))
+    elif after is not None:
+        facts.append(("With what was found", f"{text.decibels(after.excess_db)} dB", "over the noise floor"))
+    return [*facts, ("Noise floor", f"{before.noise_floor_db:.1f} dBFS", "the fan, from the calibration")]
 
 
 def _law(law: Law | None) -> dict[str, str] | None:

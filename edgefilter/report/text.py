@@ -26,6 +26,7 @@ smaller dependences, which nobody would correct."""
 LINES = 10
 """Of a diagnosis as `edgefilter diagnose` prints it without --verbose: with the command typed before it half of a terminal."""
 MORE = "more        --verbose: all figures and what else was tried; --report PAGE.html: pictures and sound"
+IRREDUCIBLE = "noise, of which no waveform can be predicted"
 CALIBRATE = "edgefilter calibrate --live --output robot.npz"
 HEADS = ("rank", "effect", "alone, dB", "added, dB", "verdict")
 
@@ -149,16 +150,12 @@ def diagnosis_lines(found: Diagnosis, calibrated: bool = True) -> list[str]:
     profile = "the profile as it is" if calibrated else "a stationary linear path"
     steps = [(profile, added[0].excess_before_db if added else found.comparison.excess_db)]
     steps += [(f"with {finding.effect}", finding.excess_after_db) for finding in added]
-    if found.irreducible_db:
-        steps.append(("irreducible part", found.irreducible_db))
     top = max(1.0, *(db for _, db in steps))
     lines = [_verdict(found, calibrated), "budget      dB over the noise floor"]
     lines += [f"  {name:<27} {decibels(db):>6}  {_bar(db / top)}".rstrip() for name, db in steps]
     for rank, finding in enumerate(found.ranking, start=1):
         lines += _finding(rank, finding)
-    if found.evidence:
-        lines.append(f"left        {sentence(found.evidence)}")
-    lines += [*_hints(found), *_proof(found), *precision_lines(found.precision)]
+    lines += [_left(found), *_hints(found), *_proof(found), *precision_lines(found.precision)]
     if found.ranking:
         lines += independence_lines(found.independence, "with all findings")
     lines += [*candidate_lines(found.tried), *(f"advice      {line}" for line in found.advice)]
@@ -174,7 +171,7 @@ def _left(found: Diagnosis) -> str:
     """Say what is left; where it is noise of the robot's own that no waveform predicts, that and no other figure."""
     whole = f" of {decibels(found.comparison.excess_db)}" if found.ranking else ""
     if found.irreducible_db:
-        told = f"{decibels(found.irreducible_db)}{whole} dB over the fan: noise, of which no waveform can be predicted."
+        told = f"{decibels(found.irreducible_db)}{whole} dB over the fan: {IRREDUCIBLE}."
     else:
         told = f"{decibels(found.remaining_db)}{whole} dB over the noise floor."
     return f"left        {told} {sentence(found.evidence)}".rstrip()

@@ -77,7 +77,7 @@ def test_the_terminal_says_verdict_budget_parameters_and_what_is_left():
         "rt60_s = 0.610 dB (0.510 to 0.710)",
         "9.0 to 1.0 dB, 90 %",
         "Evidence for my_own.",
-        "left        A hum at 50 Hz.",
+        " dB over the fan: noise, of which no waveform can be predicted. A hum at 50 Hz.",
     ):
         assert part in told, part
     bars = [len(line) - len(line.rstrip("#")) for line in lines if line.startswith("  with ")]
@@ -186,6 +186,21 @@ def test_subsets_are_compared_on_one_alignment():
     found = compare_variants(Recording(y, x, robot).straightened, model, [finding("playback_gain", {"gain_db": -3.0})])
     assert found[(True,)].excess_db < 0.3 < 3 < found[(False,)].excess_db  # 0.3 dB: see the comparison's own tests
     assert found[(True,)].offset_samples == found[(False,)].offset_samples
+
+
+def test_what_no_waveform_predicts_does_not_stand_beside_what_the_findings_leave():
+    x, robot = voice(3.0), profile()
+    y = record(x)
+    model = robot.echo.with_effect("playback_gain", {"gain_db": -3.0})
+    one = (finding("playback_gain", {"gain_db": -3.0}),)
+    found = Diagnosis("missing", compare(robot, y, x), one, "", 0.3, 8.0, model)
+    page = diagnosis_page(Recording(y, x, robot), found, {"profile": "p", "recording": "m", "reference": "r"})
+    assert "<dt>Left</dt><dd><b>8.0 dB</b> over the fan: noise" in page
+    assert "With what was found" not in page and "<dt>Irreducible" not in page
+    told = diagnosis_lines(found)
+    assert not any("irreducible" in line for line in told) and any(
+        line.startswith("left        8.0 of ") for line in told
+    )
 
 
 @pytest.mark.slow
