@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from scipy import signal
 from torch import Tensor
-from torch.nn.functional import interpolate, pad
+from torch.nn.functional import interpolate, max_pool1d, pad
 
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.filter.canceller import COLD, WARM
@@ -125,6 +125,7 @@ class _Batch:
         clean = convolved(self.human(), to_human)
         clean = clean * self.each(human_rms) / active_rms(clean)
         steady, noise = self.noise(human_rms, level, told)
+        noise = noise + self.knocks(clean, human_rms)
         warm, known, fan_db = self.profile(torch.where(gain > 0, gain, 1e-3) * response, colour)
         mic, clean, noise, (profile, steady) = self.recorded(gain * echo, clean, noise, (known, steady))
         fan_power = power(scenes.spectra(steady)).mean(1) * self.each(10 ** (fan_db / 10))
@@ -197,7 +198,7 @@ class _Batch:
 
     def speech(
         self, voices: Voices, into: Tensor, begins_s: float, lasts_s: tuple[float, float], pause_s: tuple[float, float],
-        other: bool
+        other: bool, soft: bool = False
     ) -> None:  # fmt: skip
         """Utterances of one speaker, written into a silence (n,)."""
         rng, at = self.rng, int(begins_s * SAMPLE_RATE)
@@ -207,6 +208,8 @@ class _Batch:
             said = voices.draw(rng, speaker, int(rng.uniform(*lasts_s) * SAMPLE_RATE))
             if rate != 100:
                 said = interpolate(said[None, None], scale_factor=100 / rate, mode="linear")[0, 0]
+            if soft:
+                said = said * torch.from_numpy(script.rise(rng, said.numel())).to(self.device)
             said = said[: self.n - at]
             into[at : at + said.numel()] = said
             at += said.numel() + int(rng.uniform(*pause_s) * SAMPLE_RATE)
@@ -259,9 +262,11 @@ class _Batch:
     def human(self) -> Tensor:
         """The human's speech without a room, (count, n)."""
         spoken = torch.zeros(self.count, self.n, device=self.device)
-        other, begins_s = self.happens("other_voices"), self.between("silence_s")
+        other, soft, begins_s = self.happens("other_voices"), self.happens("soft"), self.between("silence_s")
         for row in np.flatnonzero(self.happens("human")):
-            self.speech(self.sounds.humans, spoken[row], begins_s[row], (1.5, 7), (0.5, 3), bool(other[row]))
+            self.speech(
+                self.sounds.humans, spoken[row], begins_s[row], (1.5, 7), (0.5, 3), bool(other[row]), bool(soft[row])
+            )
         return spoken
 
     def recording(self) -> Tensor:
@@ -293,6 +298,18 @@ class _Batch:
         total = total + self.each(behind) * self.recording()
         moving = self.each(level * 10 ** (rng.uniform(*MOTORS_DB, self.count) / 20) * self.happens("motors"))
         return steady, total + moving * self.moved(played) * self.fans()
+
+    def knocks(self, clean: Tensor, human_rms: np.ndarray) -> Tensor:
+        """Stretches of recorded noise that fade, while the human is silent, (count, n); simulate.fan.knocks."""
+        seconds, total = torch.arange(self.n, device=self.device) / SAMPLE_RATE, torch.zeros_like(clean)
+        rms = human_rms * self.happens("knocks")
+        for _ in range(fan.KNOCKS // 2):
+            at, lasts = (self.rng.uniform(*ends, self.count) for ends in ((0, self.n / SAMPLE_RATE), fan.KNOCK_S))
+            passed = (seconds - self.each(at)) / self.each(lasts)
+            level = self.each(rms * 10 ** (self.rng.uniform(*fan.KNOCK_DB, self.count) / 20))
+            total += level * torch.where((passed >= 0) & (passed < 1), 1 - passed, 0.0) * self.recording()
+        near = max_pool1d(clean.abs()[:, None], SAMPLE_RATE // 10 + 1, 1, SAMPLE_RATE // 20)[:, 0]
+        return total * (near <= 1e-3 * near.amax(1, keepdim=True))
 
     def moved(self, played: Tensor) -> Tensor:
         """How much a robot moves that talks, 0 to 1, (count, n): its loudness over 0.1 to 0.6 s."""

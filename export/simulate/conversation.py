@@ -91,6 +91,8 @@ def simulate(recipe: Recipe, seed: int, index: int, material: Material) -> Conve
         noise = noise + fan.motors(rng, material, voice.played, level * 10 ** (rng.uniform(*MOTORS_DB) / 20))
     if hums:
         noise = noise + fan.hum(rng, samples)
+    if recipe.knocks and rng.random() < recipe.knocks:
+        noise = noise + fan.knocks(rng, material, clean, human_rms)
     microphone = Microphone.draw(rng, recipe.wideness, recipe.seconds, recipe.processed)
     mic, clean, heard_fan, gain = _recorded(microphone, robot_gain * voice.echo, clean, noise)
     profile, known = _profile(rng, recipe, material, (room, colour), microphone, gain, (robot_gain, voice.path), psd)

@@ -1,4 +1,4 @@
-"""What else the microphone hears: the robot's fan, steady or changing its speed, recorded noises, people in the background."""
+"""What else the microphone hears: the robot's fan, steady or changing its speed, recorded noises, people in the background, knocks."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 from scipy import signal
+from scipy.ndimage import maximum_filter1d
 
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.profile.data import GRID_BINS, GRID_HZ
@@ -16,6 +17,8 @@ from export.simulate.material import Material
 CHANGING, RECORDED, BACKGROUND, TALKERS = 0.2, 0.3, 0.2, 0.4
 """Shares of wide items whose fan changes its speed, whose fan is a recording, with something sounding in the background
 besides, and, of the last, those in which that is people."""
+KNOCKS, KNOCK_S, KNOCK_DB = 4, (0.03, 0.4), (-10.0, 5.0)
+"""How many an item has at most, how long each is, from a key to a cough, and over the human."""
 
 
 def noise(
@@ -70,6 +73,21 @@ def motors(rng: np.random.Generator, material: Material, played: Samples, rms: f
     loud = loud[delay : delay + played.size]
     moving = np.clip(loud / max(float(np.quantile(loud, 0.9)), 1e-9), 0.0, 1.0) ** rng.uniform(0.3, 1.5)
     return (rms / max(active_rms(sound), 1e-9) * moving * sound).astype(np.float32)
+
+
+def knocks(rng: np.random.Generator, material: Material, clean: Samples, rms: float) -> Samples:
+    """Pieces of noises about their loudest moment (n,), at KNOCK_DB over that RMS, each from where the human (n,) is silent on."""
+    total = np.zeros(clean.size, np.float32)
+    silent = np.flatnonzero(maximum_filter1d(np.abs(clean), SAMPLE_RATE // 10) <= 1e-3 * np.abs(clean).max())
+    for at in rng.choice(silent, rng.integers(1, KNOCKS + 1)) if silent.size else ():
+        sound, size = material.noise(rng, SAMPLE_RATE), int(rng.uniform(*KNOCK_S) * SAMPLE_RATE)
+        if sound is None:
+            sound = fan(rng, SAMPLE_RATE, 1.0)[0]
+        piece = np.take(sound, np.arange(size) + int(np.argmax(np.abs(sound))) - size // 8, mode="wrap")
+        piece = piece * np.minimum(1.0, np.minimum(np.arange(size) / 32, np.arange(size, 0, -1) / (size / 2)))
+        piece *= rms * 10 ** (rng.uniform(*KNOCK_DB) / 20) / max(active_rms(piece), 1e-9)
+        total[at : at + size] += piece[: clean.size - at]
+    return total
 
 
 def hum(rng: np.random.Generator, samples: int) -> Samples:

@@ -14,6 +14,8 @@ from export.simulate.recipe import Recipe
 
 RATES = (82, 122)
 """Percent of its own speed at which a voice is played to be another: from a low man's to a high woman's is about as much."""
+RISES_S = (0.05, 0.3)
+"""Within which a soft utterance has risen from nothing: a consonant to a syllable."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,12 +69,18 @@ def human(rng: np.random.Generator, recipe: Recipe, humans: Corpus, response: Sa
     said: list[Path] = []
     at = int(rng.uniform(*recipe.silence_s) * SAMPLE_RATE)
     speaker, played_at = humans.draw_speaker(rng), rate(rng, recipe)
+    soft = recipe.soft and rng.random() < recipe.soft
     while at < samples - SAMPLE_RATE:
         speech = humans.draw(rng, speaker, rng.uniform(1.5, 7.0), said, played_at)[: samples - at]
-        clean[at : at + speech.size] += speech
+        clean[at : at + speech.size] += speech * rise(rng, speech.size) if soft else speech
         at += speech.size + int(rng.uniform(0.5, 3.0) * SAMPLE_RATE)
     heard = signal.oaconvolve(clean, response)[:samples].astype(np.float32)
     return Human(heard, speaker, tuple(sorted({path.name for path in said})))
+
+
+def rise(rng: np.random.Generator, samples: int) -> Samples:
+    """Gain of speech that rises from nothing, (samples,)."""
+    return np.minimum(1.0, np.arange(samples, dtype=np.float32) / (rng.uniform(*RISES_S) * SAMPLE_RATE))
 
 
 def rate(rng: np.random.Generator, recipe: Recipe) -> int:

@@ -12,7 +12,7 @@ from edgefilter.errors import UsageError
 from export.corpus import Corpus, read_corpus
 from export.dataset import pack
 from export.rooms import draw_room
-from export.simulate import script
+from export.simulate import fan, script
 from export.simulate.conversation import simulate
 from export.simulate.effects import draw_effects, elsewhere
 from export.simulate.linear_stage import Stage, WideSetting, from_bytes, front_end, listen
@@ -233,6 +233,32 @@ def test_where_the_reference_was_found_only_about_it_is_told_early_or_late(parts
     )
     assert np.array_equal(np.roll(there["reference"], item.stage.displaced), displaced["reference"])
     assert np.array_equal(there["mic"], displaced["mic"])
+
+
+def test_the_field_alone_has_soft_humans_and_knocks():
+    assert {name for name, recipe in RECIPES.items() if recipe.soft or recipe.knocks} == {"field"}
+
+
+def test_a_soft_human_rises_from_nothing_within_300_ms_and_is_the_same_behind(parts):
+    recipe = replace(RECIPES["edge"], human=1.0, silence_s=(0.5, 0.5), soft=1.0)
+    risen = script.human(np.random.default_rng(2), recipe, parts.humans, np.ones(1, np.float32), 2 * RATE).clean
+    recipe = replace(recipe, soft=1e-9)  # drawn, and not
+    at_once = script.human(np.random.default_rng(2), recipe, parts.humans, np.ones(1, np.float32), 2 * RATE).clean
+    ratio = (risen / np.where(at_once, at_once, np.nan))[RATE // 2 :]
+    assert np.nanmax(ratio[:80]) < 0.11 and np.nanmin(ratio[round(0.3 * RATE) :]) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_knocks_are_short_as_loud_as_the_human_and_begin_while_nobody_speaks(parts):
+    clean = np.zeros(4 * RATE, np.float32)
+    clean[2 * RATE :] = 0.1 * np.random.default_rng(1).standard_normal(2 * RATE)
+    rms = active_rms(clean)
+    material = replace(parts, noises=(babble(np.random.default_rng(2), 3.0),))
+    for seed in range(20):
+        knocks = fan.knocks(np.random.default_rng(seed), material, clean, rms)
+        assert knocks.any() and not knocks[round(2.4 * RATE) :].any()  # 0.4 s: the longest
+        assert np.count_nonzero(knocks) <= fan.KNOCKS * 0.4 * RATE
+        assert -10.5 < 20 * np.log10(active_rms(knocks) / rms) < 9  # several may fall on each other
+    assert fan.knocks(np.random.default_rng(0), parts, np.zeros(RATE, np.float32), rms).any()  # nobody, no recordings
 
 
 def test_who_says_three_words_is_drawn_seldom():
