@@ -36,6 +36,8 @@ PARTS = 3
 """A quantity is cut into so many slices of about as many clips each."""
 FEW = 8
 """With fewer clips nothing is said of a conclusion."""
+TOLD_APART = (5.0, 95.0)
+"""Word errors in %: where all compared rows are beyond the same end, most utterances are all right or all wrong in each, and words say nothing."""
 NORMED = {systems.BATCH_NORM: "paper-crnn-narrow"}
 """A network with batch normalisation, and the row that it is compared with."""
 COUNTED = ("insertions", "deletions")
@@ -295,9 +297,14 @@ def conclusions(rows: Sequence[dict]) -> str:
     return "\n".join(f"- {line}" for line in (_volume_and_pitch(rows), _reverberation(rows), _batch_norm(rows)))
 
 
-def _measures(rows: Sequence[dict]) -> list[tuple[str, int, str]]:
-    """Words where there is a recogniser, and dB, which end at no 100 %; 1 where more is worse; the unit."""
-    words = [("capped", 1, "points of WER")] if metric(rows)[0] == "capped" else []
+def _saturated(rows: Sequence[dict], compared: Sequence[str]) -> bool:
+    wrong = [found["mean"] for name in compared if (found := mean(of(rows, name), "capped"))]
+    return bool(wrong) and (max(wrong) < TOLD_APART[0] or min(wrong) > TOLD_APART[1])
+
+
+def _measures(rows: Sequence[dict], compared: Sequence[str]) -> list[tuple[str, int, str]]:
+    """Words where there is a recogniser and they tell these systems apart, and dB, which end at no 100 %; 1 where more is worse; the unit."""
+    words = [("capped", 1, "points of WER")] if metric(rows)[0] == "capped" and not _saturated(rows, compared) else []
     return [*words, ("si_sdr", -1, "dB")]
 
 
@@ -308,14 +315,17 @@ def _network(rows: Sequence[dict]) -> str:
 
 def _volume_and_pitch(rows: Sequence[dict]) -> str:
     key, _, said, worse = metric(rows)
+    title, compared = "A loud or high-pitched human is understood better", ("paper-ss", _network(rows))
+    if key == "capped" and _saturated(rows, compared):
+        return f"{title}: not tested, the words are saturated."
     signs, told = [], []
     for fact, name in (("level_db", "level"), ("pitch_hz", "pitch")):
-        for system in ("paper-ss", _network(rows)):
+        for system in compared:
             if found := correlation(of(rows, system), fact, key):
                 told.append(f"{name} and {system} {found[0]:+.2f} [{found[1]:+.2f}, {found[2]:+.2f}]")
                 signs.append(_sign(-worse * found[1], -worse * found[2]))
     figures = f"Rank correlation with {said}: {'; '.join(told)}." if told else ""
-    return _verdict("A loud or high-pitched human is understood better", signs, figures)
+    return _verdict(title, signs, figures)
 
 
 def _reverberation(rows: Sequence[dict]) -> str:
@@ -323,7 +333,7 @@ def _reverberation(rows: Sequence[dict]) -> str:
     title = "Spectral subtraction suffers from reverberation, the network less"
     network = _network(rows)
     signs, told = [], []
-    for key, worse, unit in _measures(rows):
+    for key, worse, unit in _measures(rows, ("paper-ss", network)):
         draws = {}
         for system in ("paper-ss", network):
             own = [row for row in of(rows, system) if row.get(key) is not None and row["room"] in ("lab", "office")]
@@ -352,7 +362,7 @@ def _weighted(weights: np.ndarray, values: np.ndarray) -> np.ndarray:
 def _batch_norm(rows: Sequence[dict]) -> str:
     """Contradicted only where it does help."""
     signs, told = [], []
-    for key, worse, unit in _measures(rows):
+    for key, worse, unit in _measures(rows, [*NORMED, *NORMED.values()]):
         for normed, without in NORMED.items():
             found = difference(of(rows, normed), of(rows, without), key)
             if found and found["count"] >= FEW:

@@ -246,6 +246,22 @@ def test_slices_hold_every_clip_once_and_the_conclusions_follow_the_figures() ->
     assert "crnn" not in own[0] and all("not tested" in line for line in own[1:])
 
 
+@pytest.mark.parametrize("wrong", [3.0, 97.0])
+def test_words_that_are_nearly_all_right_or_all_wrong_conclude_nothing(wrong: float) -> None:
+    rows = made()
+    rows += [
+        row | {"system": name}
+        for row in rows
+        if row["system"] == "crnn"
+        for name in ("paper-crnn-narrow", systems.BATCH_NORM)
+    ]
+    for row in rows:
+        row["capped"] = wrong + (row["room"] == "office") * (row["system"] == "paper-ss")  # as concluded, by little
+    volume, reverberation, norm = evaluate.conclusions(rows).splitlines()
+    assert volume.endswith("understood better: not tested, the words are saturated.")
+    assert "dB (apart" in reverberation and " dB." in norm and "points of WER" not in reverberation + norm
+
+
 @pytest.mark.parametrize(("decibels", "verdict"), [(-4.0, "seen here as well"), (4.0, "partly seen here")])
 def test_batch_normalisation_is_scored_in_words_and_in_decibels(decibels: float, verdict: str) -> None:
     rows = made()
