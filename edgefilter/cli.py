@@ -33,6 +33,7 @@ EFFECTS = {
 }
 JSON = {"metavar": "FILE", "help": "write the figures as JSON ('-': standard output)"}
 REPORT = {"metavar": "R.html", "help": "write a page with pictures and sound, in one file"}
+VERBOSE = {"action": "store_true", "help": "print every figure in place of ten lines"}
 FORCE = {"action": "store_true", "help": "write the profile even if the running filter is worse with it"}
 
 
@@ -167,6 +168,7 @@ def _compare(commands: argparse._SubParsersAction) -> None:
     told = "say how much of a recording of the robot the profile does not explain, and where"
     option = commands.add_parser("compare", help=told).add_argument
     _recording(option, profile_needed=False)
+    option("--verbose", **VERBOSE)
     option("--report", **REPORT)
 
 
@@ -175,8 +177,7 @@ def _diagnose(commands: argparse._SubParsersAction) -> None:
     option = commands.add_parser("diagnose", help=told).add_argument
     told = "write a profile with all that was found; without --profile, one made from the recording"
     option("--apply", metavar="P2.npz", help=told)
-    told = "print every figure, and what else was tried, in place of ten lines"
-    option("--verbose", action="store_true", help=told)
+    option("--verbose", **VERBOSE)
     told = "where no effect explains the recording: write the curve, gain, filter or lag that does as an effect of your own"
     option("--write-effect", type=effect_file, metavar="MINE.py", help=told)
     option("--mic-channels", **MIC_CHANNELS)

@@ -270,9 +270,6 @@ def _finding(finding: Finding) -> dict[str, object]:
 def _notes(found: Comparison) -> list[str]:
     """Warnings and what else a reader must know about the recording."""
     notes = list(found.warnings)
-    if found.human:
-        spans = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in found.human)
-        notes.append(f"Somebody talks at {spans}; those stretches are left out of every figure.")
     seconds = found.recording.size / SAMPLE_RATE
     if seconds > MAX_SOUND_S:
         notes.append(

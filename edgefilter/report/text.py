@@ -24,8 +24,8 @@ WEIGHT = 0.01
 """Least share of the residual's power for which the text names the cause of a dependence. Half a minute of sound also shows
 smaller dependences, which nobody would correct."""
 LINES = 10
-"""Of a diagnosis as `edgefilter diagnose` prints it without --verbose: with the command typed before it half of a terminal."""
-MORE = "more        --verbose: all figures and what else was tried; --report PAGE.html: pictures and sound"
+"""Of a comparison or a diagnosis as the command prints it without --verbose: with the command typed before it half of a terminal."""
+MORE = "more        --verbose: all figures; --report PAGE.html: pictures and sound"
 IRREDUCIBLE = "noise, of which no waveform can be predicted"
 CALIBRATE = "edgefilter calibrate --live --output robot.npz"
 HEADS = ("rank", "effect", "alone, dB", "added, dB", "verdict")
@@ -99,19 +99,26 @@ def interval_text(interval: Interval) -> str:
     return ", ".join(shown) or "none"
 
 
+def comparison_summary(found: Comparison) -> list[str]:
+    """Format what a person needs of a comparison: how much is unexplained, warnings, and where most of it is."""
+    zones = found.independence.zones if found.independence else ()
+    depends = any(zone.part.dependent and zone.share >= WEIGHT for zone in zones)
+    shares = tuple((low, high, 100 * share) for low, high, share in found.lags if depends)
+    lines = _compared(found)
+    for name, where, rows, unit in (
+        ("band", "Hz", found.bands, "dB"),
+        ("time", "s", found.times, "dB"),
+        ("lag", "ms behind the reference", shares, "% of the error"),
+    ):
+        if rows:
+            low, high, value = max(rows, key=lambda row: row[2])
+            lines.append(f"{f'worst {name}':<12}{low:g} to {high:g} {where}: {decibels(value)} {unit}")
+    return lines[: LINES - 2]
+
+
 def comparison_lines(found: Comparison) -> list[str]:
     """Format a comparison: the excess as a whole, by frequency, by time, by level and by lag, and whether the residual is noise."""
-    lines = [
-        f"excess      {decibels(found.excess_db)} dB: unpredicted power over the noise floor of {decibels(found.noise_floor_db)} dBFS",
-        f"lag         {found.offset_samples:+.2f} samples relative to the calibration, compensated",
-    ]
-    if math.isfinite(found.silence_excess_db):
-        silence = decibels(found.silence_excess_db)
-        lines.append(f"silence     {silence} dB over the noise floor while the robot is silent")
-    if found.human:
-        spans = ", ".join(f"{start:.1f}-{end:.1f} s" for start, end in found.human)
-        lines.append(f"human       somebody talks at {spans}; no figure includes these times")
-    lines += [f"WARNING     {text}" for text in found.warnings]
+    lines = _compared(found)
     lines += _table("by frequency", "Hz", found.bands)
     lines += _table("by time", "s", coarser(found.times, len(found.bands)))
     lines += _table("by level of the robot's voice", "dBFS", found.levels)
@@ -119,6 +126,17 @@ def comparison_lines(found: Comparison) -> list[str]:
     for low, high, share in found.lags:
         lines.append(f"  {low:5g} to {high:4g} ms  {100 * share:5.0f} %   {_bar(share)}".rstrip())
     return lines + independence_lines(found.independence)
+
+
+def _compared(found: Comparison) -> list[str]:
+    lines = [
+        f"excess      {decibels(found.excess_db)} dB: unpredicted power over the noise floor of {decibels(found.noise_floor_db)} dBFS",
+        f"lag         {found.offset_samples:+.2f} samples relative to the calibration, compensated",
+    ]
+    if math.isfinite(found.silence_excess_db):
+        silence = decibels(found.silence_excess_db)
+        lines.append(f"silence     {silence} dB over the noise floor while the robot is silent")
+    return lines + [f"WARNING     {text}" for text in found.warnings]
 
 
 def first_sight_line(seen: Mapping[str, float]) -> str:

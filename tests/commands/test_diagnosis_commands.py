@@ -36,9 +36,21 @@ def printed_json(capsys):
     return json.loads(capsys.readouterr().out)
 
 
-def test_compare_says_how_much_is_unexplained_and_where(scene, capsys):
+def test_compare_says_in_ten_lines_how_much_is_unexplained_where_most_of_it_is_and_what_to_type_next(scene, capsys):
     assert main(arguments(scene, "compare")) == 0
-    out = capsys.readouterr().out
+    *lines, following = capsys.readouterr().out.splitlines()
+    starts = [line[:12].strip() for line in lines]
+    assert starts == ["excess", "lag", "silence", "worst band", "worst time", "worst lag", "more"]
+    assert lines[5].startswith("worst lag   4 to 10 ms behind the reference: ") and max(map(len, lines)) <= 80
+    files = " ".join(arguments(scene, "diagnose"))
+    assert following == f"next        edgefilter {files}"
+
+
+def test_compare_says_how_much_is_unexplained_and_where(scene, capsys):
+    assert main(arguments(scene, "compare", "--verbose")) == 0
+    *lines, following = capsys.readouterr().out.splitlines()
+    out = "\n".join(lines)
+    assert following.startswith("next        edgefilter diagnose --profile ")
     for words in (
         "excess ",
         "over the noise floor of -60.0 dBFS",
@@ -49,7 +61,7 @@ def test_compare_says_how_much_is_unexplained_and_where(scene, capsys):
         "silence",
     ):
         assert words in out, out
-    assert max(len(line) for line in out.splitlines()) <= 80
+    assert max(map(len, lines)) <= 80
     assert main(arguments(scene, "compare", "--json", "-")) == 0
     found = printed_json(capsys)
     assert found["schema"] == 1 and found["excess_db"] > 3 and f"{found['excess_db']:.1f} dB" in out

@@ -20,7 +20,7 @@ from edgefilter.echo.effects.catalogue import EFFECTS, find
 from edgefilter.report import text
 from edgefilter.report.html import choices, compare_variants, diagnosis_page
 from edgefilter.report.media import LEVELS, MAX_COLUMNS, colour_scale, colours, sound, spectrogram_db, spectrogram_png
-from edgefilter.report.text import LINES, add_command, coarser, diagnosis_lines, summary_lines
+from edgefilter.report.text import LINES, add_command, coarser, comparison_summary, diagnosis_lines, summary_lines
 from edgefilter.types import SAMPLE_RATE as RATE
 from tests.diagnosis.robot_scene import profile, record, voice
 
@@ -96,6 +96,14 @@ def test_few_lines_say_what_is_wrong_how_sure_that_is_and_what_is_left():
     assert lines[5].startswith("left        0.3 of ") and "noise floor" in lines[5]
     (left,) = (one for one in summary_lines(replace(diagnosis, irreducible_db=8.0)) if one.startswith("left"))
     assert left.startswith("left        8.0 of ") and "0.3" not in left
+
+
+def test_a_comparison_has_ten_lines_too_and_no_worst_lag_where_nothing_depends_on_the_reference():
+    x = voice(4.0)
+    found = compare(profile(), record(x), x)
+    assert [line[:12].strip() for line in comparison_summary(found)[3:]] == ["WARNING", "worst band", "worst time"]
+    many = comparison_summary(replace(found, warnings=tuple(f"warning {i}" for i in range(9))))
+    assert len(many) == LINES - 2 and [line[:7] for line in many[3:]] == 5 * ["WARNING"]
 
 
 def test_a_range_that_says_nothing_is_not_told():
