@@ -191,7 +191,8 @@ def run(options: argparse.Namespace) -> str:
     names, missing = contenders()
     names = options.contenders.split(",") if options.contenders else names
     load = os.getloadavg()[0]
-    made_with = provenance.stamp({"DEMO": [DEMO]}, [name for name in names if name not in PEERS])
+    judged = [provenance.TIMED, *(name for name in names if name not in PEERS)]
+    made_with = provenance.stamp({"DEMO": [DEMO]}, judged)
     turns = [(name, paced) for paced in (False, True) for name in names]
     runs: dict[tuple[str, bool], list[dict]] = defaultdict(list)
     for number in progress(range(options.rounds), "round"):

@@ -25,8 +25,11 @@ from edgefilter.errors import EdgefilterError
 from edgefilter.filter.budget import DEMO
 from edgefilter.profile.data import Profile
 
+PACKAGE = Path(edgefilter.__file__).parent
 DIAGNOSIS = "diagnosis"
 """Stands among the systems for the names and values that the diagnosis finds."""
+TIMED, RUNNING = "timed code", ("alignment", "dsp", "engines", "filter")
+"""Stands among the systems for the code of the running path, in these folders, where it is timed: slower code may give the same sound."""
 LEARNING = "-learning"
 """Ends the names of systems that learn, which takes half of all the time here: they are judged by one demonstration."""
 
@@ -39,7 +42,7 @@ def stamp(
     """What a result is made with and from, ready for JSON; take it before measuring.
 
     data: folders (or files) that are read, by what they are: {"HUMAN": [Path("human/val")]}; of a folder its last
-    part is written down, with its digest. systems: rows of bench/systems.py that are measured, or "diagnosis";
+    part is written down, with its digest. systems: rows of bench/systems.py that are measured, DIAGNOSIS or TIMED;
     `python -m bench stale` compares what they do with today's. models: files or folders by name, None where none is used. Raises
     UsageError for what is not there.
     """
@@ -122,6 +125,8 @@ def digest_of(name: str) -> str | None:
     """Of what a system makes of the demonstrations, as 16-bit samples; None where it cannot run on them."""
     if name == DIAGNOSIS:
         return _of_diagnosis()
+    if name == TIMED:
+        return results.code_digest(path for one in RUNNING for path in sorted((PACKAGE / one).rglob("*.py")))[:16]
     from bench import systems  # slow to load
 
     found = systems.catalogue().get(name)

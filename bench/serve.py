@@ -122,7 +122,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> str:
     names = options.engines.split(",")
     load = os.getloadavg()[0]
-    made_with = provenance.stamp({"DEMO": [DEMO]}, names)
+    made_with = provenance.stamp({"DEMO": [DEMO]}, [provenance.TIMED, *names])
     rng = np.random.default_rng(options.seed)
     rows = [row for name in names for row in climb(name, options.seconds, rng)]
     times = [(f"{key}, ms", 1) for key in PERCENTILES]

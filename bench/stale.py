@@ -1,8 +1,8 @@
 """Which results are of another behaviour than today's; exit 1 and their names, if there are any.
 
 Each result holds a digest of what every system that it measured makes of the bundled demonstrations; of the diagnosis, of
-the names and values that it finds there. A pure move of code leaves them equal. Make a stale result anew, or delete it
-with the sentences that quote it.
+the names and values that it finds there; of computing times, of the code that ran. A pure move of code leaves all but the
+last equal. Make a stale result anew, or delete it with the sentences that quote it.
 """
 
 from __future__ import annotations

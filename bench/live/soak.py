@@ -54,7 +54,7 @@ changes its speed by more than that, and the bypass with it."""
 def run(options: argparse.Namespace) -> str:
     engine = options.engine or "auto"
     # "auto" is crnn wherever that is fast enough
-    made_with = provenance.stamp({"DEMO": [DEMO]}, [options.engine or "crnn"])
+    made_with = provenance.stamp({"DEMO": [DEMO]}, [provenance.TIMED, options.engine or "crnn"])
     part, is_live = options.part, options.part == "hour"
     found = live(options.minutes, engine) if is_live else from_file(options.minutes, engine)
     found["load_average"] = os.getloadavg()[0]

@@ -43,6 +43,25 @@ def test_a_result_is_stale_where_a_system_gives_another_sound(
     provenance.digest_of.cache_clear()
 
 
+def test_a_computing_time_is_stale_where_the_code_that_ran_is_another_though_it_sounds_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(provenance, "PACKAGE", tmp_path)
+    monkeypatch.setattr(provenance, "_found", {})
+    files = [tmp_path / folder / "code.py" for folder in (*provenance.RUNNING, "commands")]
+    for file in files:
+        file.parent.mkdir()
+        file.write_text("quick = True")
+    page = tmp_path / "latency"
+    results.write(page, "latency", "L", provenance.stamp(systems=[provenance.TIMED]))
+    files[-1].write_text("what no hop runs = True")
+    for file, reasons in ((files[-1], []), (files[0], ["latency.json, latency: timed code behave differently now"])):
+        file.write_text("quick = False")
+        provenance.digest_of.cache_clear()
+        assert stale.stale(page.with_suffix(".json"), Cache(None)) == reasons
+    provenance.digest_of.cache_clear()
+
+
 def test_what_is_learned_is_computed_once_for_the_same_code_and_anew_for_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
