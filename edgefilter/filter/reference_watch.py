@@ -39,7 +39,7 @@ Verdict = Literal["unknown", "fits", "late"]
 
 
 class ReferenceWatch:
-    """Says once what is wrong with the reference, hop by hop, of what the aligner believes and of how loud both channels are.
+    """Says what is wrong with the reference, once each time it begins, by what the aligner believes and how loud both channels are.
 
     hop: samples a step. bins: of a spectrum. verdict: "late" or "fits" once either is certain. without: whether the robot is
     heard while the reference is silent. same: whether microphone and reference are one signal.
@@ -102,49 +102,46 @@ class ReferenceWatch:
         self._loudest = max(self._loudest, self._sustained.step(power))
         if power > LAST_BIT:
             self._least = min(power, self._rise * self._least)
-        checks: tuple[tuple[EventKind, str], ...] = (
+        # of each cause what is to be said while it lasts, "" once it has certainly ended, and None where neither is known
+        causes: tuple[tuple[EventKind, str | None], ...] = (
             ("reference_late", self._late_by(aligned.belief, aligned.past)),
-            ("robot_unfound", self._far_behind() or self._unheard(aligned)),
+            ("robot_unfound", self._far_behind()),
+            ("robot_unfound", self._unheard(aligned)),
             ("echo_unpredicted", self._unpredicted(removal)),
             ("same_signal", self._same(pre_emphasised(mic), pre_emphasised(ref))),
             ("reference_gaps", self._lacks_samples()),
             ("rate_mismatch", self._compare_speed(aligned)),
-            (
-                "reference_missing",
-                self._wait_for_any(power, played) or self._listen_without(played, aligned, frame, speaking),
-            ),
+            ("reference_missing", self._wait_for_any(power, played)),
+            ("reference_missing", self._listen_without(played, aligned, frame, speaking)),
         )
-        return [(kind, detail) for kind, detail in checks if detail]
+        began = [(kind, detail) for kind, detail in causes if detail and kind not in self._said]
+        self._said = {kind for kind, detail in causes if detail or (detail is None and kind in self._said)}
+        return began
 
-    def _once(self, what: str) -> bool:
-        """Whether this is the first time."""
-        first = what not in self._said
-        self._said.add(what)
-        return first
-
-    def _unpredicted(self, removal: Removal) -> str:
-        """Say that hardly anything of the robot can be subtracted."""
-        if not removal.unpredicted or self._displaced or self._grew or not self._once("unpredicted"):
-            return ""
+    def _unpredicted(self, removal: Removal) -> str | None:
+        """Say that hardly anything of the robot can be subtracted; an echo that is predicted after all is linear for good."""
+        if not removal.unpredicted or self._displaced or self._grew:
+            return None
         return (
             f"the linear stage removes only {removal.removed_db:.1f} dB of the robot: the microphone seems to be processed, the"
             " loudspeaker distorts, or the reference is of another recording; switch off noise suppression, gain control and"
             " echo cancellation of the device, and turn the volume down"
         )
 
-    def _lacks_samples(self) -> str:
+    def _lacks_samples(self) -> str | None:
         """Say that the lag grows again and again, and not because the reference is played more slowly."""
-        if not self._missing or not self._seen_speeds or self._off_speed or not self._once("gaps"):
-            return ""
+        if not self._missing or not self._seen_speeds or self._off_speed:
+            return None if self._missing else ""
         return (
             f"{self._missing}; little of the robot is removed, and nobody is noticed while it talks; use a loopback that loses"
             " nothing, or larger buffers"
         )
 
-    def _compare_speed(self, aligned: Aligned) -> str:
+    def _compare_speed(self, aligned: Aligned) -> str | None:
         """While the echo is not found, look for it at other speeds, one of them a hop; add up what looks have found."""
         if aligned.state == "locked":
             self._off_speed, self._seen_speeds, self._speeds = False, [(0.0, CLEAR)], iter(())
+            self._looks_left = SPEED_LOOKS
             return ""
         heard, ref, onsets = aligned.past
         self._to_compare = LENGTH if self._idle else self._to_compare - self._hop * onsets.active
@@ -155,40 +152,38 @@ class ReferenceWatch:
                 self._to_compare, self._looks_left = SPEED_STRIDE, self._looks_left - 1
                 self._speeds = speeds(heard.read(start, start + LENGTH), ref.read(start - BEHIND, ref.end))
                 next(self._speeds)  # while both are as they were read
-            return ""
+            return None
         speed = math.log(found[0])
         self._seen_speeds.append((speed, found[1]))
         right = sum(clear for at, clear in self._seen_speeds if abs(at) <= STEP / 2)
         alike = sum(clear for at, clear in self._seen_speeds if abs(at) > STEP / 2 and abs(at - speed) < STEP)
         if abs(speed) <= STEP / 2 or alike - right < CLEAR:
-            return ""
+            return None
         self._off_speed = True
-        if not self._once("speed"):
-            return ""
         off, way = 100 * abs(found[0] - 1.0), "faster" if speed > 0.0 else "slower"
         return (
             f"the loudspeaker plays the reference {off:.1f} % {way} than it is given{other_rates(found[0])}; nothing of the"
             " robot is removed, and nobody is noticed while it talks; give the player the rate that its sound has"
         )
 
-    def _same(self, mic: Samples, ref: Samples) -> str:
+    def _same(self, mic: Samples, ref: Samples) -> str | None:
         """Add up products of both channels until they hold enough sound to tell whether they are one signal."""
         products = float(mic.dot(ref)), float(mic.dot(mic)), float(ref.dot(ref))
         if min(products[1:]) > LAST_BIT * self._hop:
             self._products += products
             self._sounding += self._hop
         if self._sounding < SAME_S * SAMPLE_RATE:
-            return ""
+            return None
         self.same = one_signal(*self._products)
         self._products, self._sounding = np.zeros(3), 0
-        if not self.same or not self._once("same"):
+        if not self.same:
             return ""
         return (
             "the microphone and the reference are the same signal: all of it is taken for the robot and removed; give the"
             " microphone's own recording or device, and for the reference what the loudspeaker plays"
         )
 
-    def _listen_without(self, played: float, aligned: Aligned, frame: Frame, speaking: bool) -> str:
+    def _listen_without(self, played: float, aligned: Aligned, frame: Frame, speaking: bool) -> str | None:
         """Learn the spectrum of the robot at the microphone, and look for it there while the reference is silent."""
         now = aligned.past.ref.end
         if played > FELL_SILENT * self._played:
@@ -203,8 +198,8 @@ class ReferenceWatch:
         if now - self._played_at < lag + SAMPLE_RATE // 4:
             return ""
         robot = self._sound.compare(fourier.power(frame.mic), frame.noise_psd)
-        if robot is None or robot == self.without:
-            return ""
+        if robot is None:
+            return None
         self.without = robot
         return robot * (
             f"the reference has been silent for {(now - self._played_at) / SAMPLE_RATE:.0f} s, while the microphone hears what"
@@ -212,10 +207,10 @@ class ReferenceWatch:
             " device?"
         )
 
-    def _late_by(self, belief: Belief | None, past: Past) -> str:
-        """Take in what is believed after another look; say once that the reference is late."""
+    def _late_by(self, belief: Belief | None, past: Past) -> str | None:
+        """Take in what is believed after another look; say that the reference is late."""
         if belief is None:
-            return ""
+            return None
         self._grew, late = bool((belief.steps[0][-1:] > 0).any()), belief.late[-1]
         if belief.missing or belief.lossy <= 1.0:  # once certain, as long as any look speaks for it
             self._missing = belief.missing
@@ -231,7 +226,7 @@ class ReferenceWatch:
         elif late < 1.0 / (CERTAIN + 1.0):
             self.verdict = "fits"
         self._late = -int(belief.lags[-1]) if self.verdict == "late" else 0
-        if not self._late or not self._once("late"):
+        if self.verdict != "late":
             return ""
         return (
             f"the reference comes {1000 * self._late / SAMPLE_RATE:.0f} ms after the microphone has heard it: the robot is"
@@ -241,7 +236,7 @@ class ReferenceWatch:
 
     def _far_behind(self) -> str:
         """Say that the robot is heard later than its lag is followed."""
-        if not self._behind or not self._once("unfound"):
+        if not self._behind:
             return ""
         return (
             f"the microphone hears the reference {self._behind / SAMPLE_RATE:.1f} s after it comes, and a lag of {MOST_LAG_S:g} s is the most"
@@ -249,13 +244,13 @@ class ReferenceWatch:
             " shorten what the player has waiting"
         )
 
-    def _unheard(self, aligned: Aligned) -> str:
+    def _unheard(self, aligned: Aligned) -> str | None:
         """Say that the microphone hears something while the reference plays, but not the reference."""
         if aligned.state == "locked":  # what was believed before is refuted
             self._another = False
-            self._said.discard("unfound")
-        if not self._another or self._displaced or not self._once("unfound"):
             return ""
+        if not self._another or self._displaced:
+            return None
         return (
             f"the microphone is {10 * math.log10(max(self._levels)):.0f} dB louder than its silence while the reference carries"
             " sound, which is not found in it: it is another sound than the loudspeaker's, too late, or processed on the way,"
@@ -269,7 +264,7 @@ class ReferenceWatch:
             return ""
         self._silent += self._hop
         self._heard += self._hop if power > SILENT else 0
-        if self._silent < NONE_CAME or self._heard < SOUNDED or not self._once("missing"):
+        if self._silent < NONE_CAME or self._heard < SOUNDED:
             return ""
         return (
             f"the reference has been silent for {self._silent / SAMPLE_RATE:.0f} s, since the start: if the robot has"

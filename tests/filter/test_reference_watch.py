@@ -359,6 +359,47 @@ def test_an_utterance_that_is_found_in_the_end_is_not_said_to_be_unfound_hop_aft
     assert [kind for found in said for kind, _ in found] == ["robot_unfound"]
 
 
+def look(late=0.0, lags=(0, 0, 0, 0)):
+    """What is believed of the lag in so many seconds."""
+    seconds = len(lags)
+    return Belief(
+        RATE * np.arange(seconds), np.array(lags), np.ones(seconds), np.full(seconds, late), np.zeros(seconds), 9.0
+    )
+
+
+GROWS, ONCE = look(lags=(0, 300, 600, 900)), look(lags=(0, 0, 0, 300))
+
+
+@pytest.mark.parametrize(
+    ("kind", "looks", "at"),
+    [
+        ("reference_late", [look(p) for p in (0.999, 0.5, 0.999, 0.001, 0.5, 0.999)], [0, 5]),
+        ("reference_gaps", [GROWS, ONCE, GROWS, look(), ONCE, GROWS], [1, 5]),
+    ],
+)
+def test_a_fault_that_has_certainly_ended_is_told_again_when_it_begins_again(kind, looks, at):
+    """It was told once in all: a reference that was late, mended, and late again, only the first time."""
+    watch, hop, onsets = ReferenceWatch(1600, 1601), np.ones(1600, np.float32), OnsetDetector(1600)
+    locked = Aligned(hop, 0.0, 0.0, 0.0, "locked", False, past=Past(DelayBuffer(1600), DelayBuffer(1600), onsets))
+    said = [
+        watch.step(hop, -hop[::-1], locked._replace(belief=one), SILENT_FRAME, Removal(1600), False) for one in looks
+    ]
+    assert [[found for found, _ in told].count(kind) for told in said] == [number in at for number in range(len(looks))]
+
+
+def test_another_speed_is_told_again_after_the_robot_was_found_in_between(monkeypatch):
+    monkeypatch.setattr("edgefilter.filter.reference_watch.speeds", lambda mic, ref: iter((None, (1.05, 2.0))))
+    watch, hop, onsets, said = ReferenceWatch(1600, 1601), np.ones(1600, np.float32), OnsetDetector(1600), []
+    past = Past(DelayBuffer(BEHIND + LENGTH + AHEAD), DelayBuffer(BEHIND + LENGTH + AHEAD), onsets)
+    for state in 4 * (["begun"] * 80 + ["locked"]):
+        for buffer in past[:2]:
+            buffer.push(hop)
+        onsets.step(hop)
+        aligned = Aligned(hop, 0.0, 0.0, 0.0, state, False, past=past)
+        said += watch.step(hop, -hop[::-1], aligned, SILENT_FRAME, Removal(1600), False)
+    assert [kind for kind, _ in said].count("rate_mismatch") == 4
+
+
 def test_where_hardly_anything_sounds_a_speed_is_not_clear_beyond_all_bounds():
     """Nothing was anywhere else, and the ratio to it 4e10."""
     mic, ref = np.zeros(LENGTH, np.float32), np.zeros(BEHIND + LENGTH + AHEAD, np.float32)
