@@ -44,10 +44,10 @@ SOON_S = 0.5
 AHEAD_DB = 1.0
 """The best peer counts as ahead on a device by more than this."""
 NOTES = """SI-SDR and word errors (at most 100 % an utterance) over the human who was laid on; the robot alone: by how much
-its recordings are lowered as a whole; false starts: every `speech_started` in them. Means are of devices, each with the same
-weight, and so are their 95 % intervals; differences are paired by device. 'Kept apart' are a device that was not looked at while
-the filter was made, and the second half of one whose first half was tuned on; the others stand apart. Peers get microphone
-and reference as the engines do."""
+its recordings are lowered as a whole, and the median of their frames; false starts: every `speech_started` in them. Means
+are of devices, each with the same weight, and so are their 95 % intervals; differences are paired by device. 'Kept apart' are
+a device that was not looked at while the filter was made, and the second half of one whose first half was tuned on; the
+others stand apart. Peers get microphone and reference as the engines do."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -83,7 +83,12 @@ def run(options: argparse.Namespace) -> str:
     tables += [against_peers(rows, here, tuned_on), barge_in(rows, here, tuned_on), as_recorded(rows, here)]
     tables.append(results.absent(absent))
     return results.write(options.output, "devices", "Real devices", made_with, [one for one in tables if one["rows"]],
-                         notes=NOTES, rows=results.columns(slim(rows)))  # fmt: skip
+                         notes=f"{NOTES} {levels(options)}", rows=results.columns(slim(rows)))  # fmt: skip
+
+
+def levels(options: argparse.Namespace) -> str:
+    many = ", ".join(f"{level:g}" for level in options.levels)
+    return f"Humans are {' to '.join(f'{ser:g}' for ser in options.ser)} dB over the echo, on devices of many recordings {many}."
 
 
 def find_clips(options: argparse.Namespace) -> list[Clip]:
@@ -123,7 +128,8 @@ def overview(name: str, title: str, rows: Sequence[dict], here: Sequence[System]
         len({row["room"] for row in part}) for part in (rows, [r for r in rows if r["set"] == "laid"])
     )
     columns = ["system", ("SI-SDR, dB", 1), ("worst device", 1), ("words wrong, %", 0), ("robot alone, dB", 1),
-               ("worst device", 1), "false starts", f"noticed in {SOON_S} s", ("dB less crnn", 1), ("words less crnn", 0)]  # fmt: skip
+               ("worst device", 1), ("median frame", 1), "false starts", f"noticed in {SOON_S} s", ("dB less crnn", 1),
+               ("words less crnn", 0)]  # fmt: skip
     cells = []
     for one in here:
         laid, alone = (of(rows, one.name, part) for part in ("laid", "alone"))
@@ -132,7 +138,8 @@ def overview(name: str, title: str, rows: Sequence[dict], here: Sequence[System]
         less = [difference(per_device(laid, key), per_device(base, key), key) for key in ("si_sdr", "capped")]
         cells.append([one.title, mean(ratio, "si_sdr"), min((row["si_sdr"] for row in ratio), default=None),
                       mean(per_device(laid, "capped"), "capped"), mean(lowered, "erle_db"),
-                      min((row["erle_db"] for row in lowered), default=None), starts(alone), soon(laid), *less])  # fmt: skip
+                      min((row["erle_db"] for row in lowered), default=None),
+                      mean(per_device(alone, "erle_frames_db"), "erle_frames_db"), starts(alone), soon(laid), *less])  # fmt: skip
     return results.table(name, f"{title}: {devices}, a human laid on {with_human}", columns, cells if devices else [])
 
 
@@ -237,7 +244,7 @@ def against_peers(rows: Sequence[dict], here: Sequence[System], tuned_on: set[st
         ahead += less[0] is not None and less[0]["mean"] < -AHEAD_DB
         cells.append([marked(device, tuned_on), best.title, means[best], *less])
     columns = ["device", "best peer", ("its SI-SDR, dB", 1), ("crnn less it, dB", 1), ("words less its, points", 0)]
-    text = f"The best peer is ahead of `crnn`, uncalibrated, by more than {AHEAD_DB:.0f} dB on {ahead} of {len(cells)} devices."
+    text = f"The best peer is ahead of `crnn`, uncalibrated, by more than {AHEAD_DB:.0f} dB of SI-SDR on {ahead} of {len(cells)} devices."
     return results.table("peers", "Against the best peer of each device", columns, cells, text)
 
 

@@ -107,8 +107,8 @@ def score(clip: Clip, output: Output, cached: CachedMetrics) -> dict:
     """All figures of one system on one clip; "problem" in place of what an unusable output makes impossible.
 
     si_sdr, estoi and the words are over the span in which the human speaks; erle_db over the ALONE_S before it, or over
-    the whole of a recording in which nobody speaks; excess_db is the most by which a second is louder than the
-    microphone; delay_s and early, or false_starts, for systems that tell events.
+    the whole of a recording in which nobody speaks, where erle_frames_db is the median of its frames; excess_db is the most
+    by which a second is louder than the microphone; delay_s and early, or false_starts, for systems that tell events.
     """
     out, mic, ref = output.samples, clip.mic, clip.ref
     row: dict = {"duration": mic.size / SAMPLE_RATE}
@@ -120,7 +120,7 @@ def score(clip: Clip, output: Output, cached: CachedMetrics) -> dict:
     if clip.human is None:
         row |= cached.mos(*(x[-round(MOS_S * SAMPLE_RATE) :] for x in (mic, ref, out)), clip.talk)
         if clip.talk == "farend":
-            row["erle_db"] = lowered_db(mic, out)
+            row |= {"erle_db": lowered_db(mic, out), "erle_frames_db": frames_db(mic, out)}
             row |= {} if output.events is None else {"false_starts": starts(output.events)}
         if clip.talk == "nearend":
             row["si_sdr_mic"] = si_sdr(out, mic)
@@ -142,6 +142,13 @@ def score(clip: Clip, output: Output, cached: CachedMetrics) -> dict:
 def lowered_db(mic: Samples, out: Samples) -> float | None:
     """ERLE, dB; None where one of both is silent."""
     return erle(mic, out) if mic.any() and out.any() else None
+
+
+def frames_db(mic: Samples, out: Samples) -> float:
+    """Median ERLE of the frames within FIRST_DB of the microphone's loudest, dB: a few loud ones decide over their energy."""
+    heard, left = frame_power(mic), frame_power(out)
+    loud = heard >= 10 ** (-FIRST_DB / 10) * heard.max()
+    return float(np.median(10 * np.log10((heard[loud] + FLOOR) / (left[loud] + FLOOR))))
 
 
 def frame_power(x: Samples, frame: int = FRAME) -> np.ndarray:

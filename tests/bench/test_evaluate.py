@@ -124,6 +124,10 @@ def test_every_device_has_its_row(pairs: Path, speech: Path, tmp_path: Path) -> 
     assert kept["linear, uncalibrated"][1]["mean"] == pytest.approx(ratios["device1"][1])
     lowered = {row[0]: row[1:] for row in table(part, "erle_db")["rows"]}
     assert lowered["device1"][0] == pytest.approx(0.0) and lowered["device1"][1] > 10  # an echo of one tap
+    at = table(part, "headline")["columns"].index("median frame")
+    assert kept["Unfiltered"][at]["mean"] == pytest.approx(0.0) and kept["linear, uncalibrated"][at]["mean"] > 10
+    assert part["notes"].endswith("Humans are -14 to -6 dB over the echo, on devices of many recordings -10.")
+    assert "by more than 1 dB of SI-SDR on" in table(part, "peers")["text"]
     assert [row[0] for row in table(part, "interrupts-headline")["rows"]] == ["crnn, uncalibrated"]
     assert [row[0] for row in table(part, "barge-in")["rows"]] == ["x (tuned on)", "device1"][::-1]
     against = {row[0]: row[3]["mean"] for row in table(part, "peers")["rows"]}

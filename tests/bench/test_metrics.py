@@ -146,6 +146,16 @@ def test_louder_than_the_microphone_is_found_in_one_second_of_ten():
     )
 
 
+def test_one_burst_that_is_left_decides_over_the_energy_and_not_over_the_median_frame():
+    mic = np.random.default_rng(0).standard_normal(4 * RATE).astype(np.float32)
+    out = 10 ** (-30 / 20) * mic
+    out[:RATE] = mic[:RATE]
+    assert metrics.frames_db(mic, out) == pytest.approx(30.0, abs=0.01)
+    assert metrics.lowered_db(mic, out) == pytest.approx(6.0, abs=0.1)
+    mic[2 * RATE :] *= 1e-3  # pauses, in which nothing is lowered
+    assert metrics.frames_db(mic, mic * np.repeat([0.1, 1.0], 2 * RATE)) == pytest.approx(20.0, abs=0.01)
+
+
 def test_noise_out_of_digital_silence_counts_as_louder():
     assert excess_db(bursts(0, 2), np.zeros(2 * RATE, np.float32)) > 60
 
