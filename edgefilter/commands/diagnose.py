@@ -12,6 +12,7 @@ from edgefilter.commands.add import Fitted, Refused, fit
 from edgefilter.commands.display import interject, print_result, progress, report_part
 from edgefilter.commands.recordings import load, load_array
 from edgefilter.diagnosis.criteria import Criteria
+from edgefilter.diagnosis.proof import lasts
 from edgefilter.diagnosis.recording import Recording
 from edgefilter.diagnosis.result import Diagnosis, in_order
 from edgefilter.echo.effect import vanishes
@@ -77,6 +78,8 @@ def main(args: argparse.Namespace) -> None:
         lines = [*diagnosis_lines(found, calibrated), *told]
     else:
         lines = [*summary_lines(found, calibrated, LINES - 2 - len(told)), *told, MORE]
+        if not (args.prove or args.apply) and any(lasts(finding.effect) for finding in found.ranking):
+            lines[-1] += f"; {'--prove' if calibrated else '--apply P2.npz'}: what it costs in the running filter"
     more["at_first_sight"] = {family: round(gain_db, 2) for family, gain_db in seen.items()}
     print_result(args, lines, {**found.to_dict(), **more})
     if html:

@@ -147,6 +147,9 @@ def test_diagnose_finds_what_is_missing_and_writes_the_documented_json(scene, ca
     assert "verdict     missing: The recording differs from the profile by a turned volume." in out
     assert out.splitlines()[-1].startswith("next        edgefilter add playback_gain --profile ")
     assert len(out.splitlines()) <= 10 and "by frequency" not in out
+    assert out.splitlines()[-2].endswith("; --prove: what it costs in the running filter")
+    assert main(arguments(scene, "diagnose", "--prove")) == 0
+    assert "running filter, " in (out := capsys.readouterr().out) and "--prove" not in out
 
 
 @pytest.mark.slow
