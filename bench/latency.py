@@ -6,7 +6,8 @@
 Every measurement is a process of its own, held to CORES cores, with one thread. Contenders take turns, in reversed order
 every other round, so that a change of the machine's speed meets all of them. Paced: a hop begins when a device would
 deliver it, the processor idles in between. Beside a learner: another process learns from the same hops. The sound is the
-bundled conversation (simulated robot), over and over; the first WARM_UP_S are left out.
+bundled conversation (simulated robot), over and over; the first WARM_UP_S are left out. How soon a fresh process answers is
+measured apart, STARTS times.
 """
 
 from __future__ import annotations
@@ -44,7 +45,12 @@ PEERS = (YARDSTICK, "speexdsp-suppressed", "aec3")
 LEARNING = "-learning"
 LEARNERS = ("linear", "crnn")
 """Engines that are also timed beside a learner: the one that leaves it most of the processor, and the one that leaves it least."""
-SLOWEST = 5
+SLOWEST, STARTS = 5, 5
+BEGIN = """from edgefilter import EgoFilter; import numpy as np
+ego, hop = EgoFilter(engine="crnn"), np.zeros(256, np.float32)
+while not ego.process(hop, hop).size: pass
+print("heard", flush=True)"""
+"""What such a process does: an uncalibrated filter, up to the first block that returns samples."""
 PERCENTILES = ("p50", "p95", "p99", "max")
 PACE = {True: "paced", False: "back to back"}
 
@@ -144,6 +150,19 @@ def run_hops(name: str, seconds: float, paced: bool) -> dict:
     return json.loads(done.stdout)
 
 
+def start_ms() -> float:
+    """Milliseconds until a fresh process has filtered its first sound, the median of STARTS."""
+    took = []
+    for _ in range(STARTS):
+        began = time.perf_counter()
+        with subprocess.Popen([sys.executable, "-c", BEGIN], stdout=subprocess.PIPE, cwd=results.ROOT) as process:
+            heard = process.stdout.readline() if process.stdout else b""
+            took.append(1000 * (time.perf_counter() - began))
+        if not heard:
+            raise UsageError("the filter returned no sound in a fresh process: try edgefilter demo")
+    return float(np.median(took))
+
+
 def contenders() -> tuple[list[str], dict[str, str]]:
     """Whatever can run here, and why the rest cannot."""
     usable, missing = ["bypass"], {}
@@ -198,13 +217,15 @@ def run(options: argparse.Namespace) -> str:
     for number in progress(range(options.rounds), "round"):
         for name, paced in turns if number % 2 == 0 else turns[::-1]:
             runs[name, paced].append(run_hops(name, options.seconds, paced))
+    first = results.table("start", "First hop after the start of a process", ["", (f"ms, median of {STARTS}", 0)],
+                          [["crnn, uncalibrated", start_ms()]] if "crnn" in names else [])  # fmt: skip
     rows = [{"contender": name, "paced": paced, **summary(runs[name, paced])} for name, paced in turns]
     conditions = f"{options.rounds} rounds of {options.seconds:g} s each, {CORES} of {os.cpu_count()} cores, one thread"
     said = "Milliseconds a hop; missed: hops that took longer than they last."
     notes = [f"{conditions}, load average before {load:.2f}. {said}"]
     notes += [f"{name} is not in the table: {why}" for name, why in missing.items()]
     plots = [results.plot("hops", [_panel(runs, names, paced) for paced in (True, False)])]
-    return results.write(options.output, "latency", "Latency and cost per hop", made_with, tables(rows), plots,
+    return results.write(options.output, "latency", "Latency and cost per hop", made_with, [*tables(rows), first], plots,
                          "\n\n".join(notes), rows=rows)  # fmt: skip
 
 

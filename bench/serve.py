@@ -19,13 +19,13 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 from websockets.asyncio.client import connect
 
 from bench import provenance, results
 from bench.latency import PERCENTILES
+from bench.live.virtual_sound import processor_s
 from bench.metrics import percentiles
 from bench.recordings import progress, read
 from edgefilter import engines
@@ -89,12 +89,6 @@ async def clients(address: str, streams: int, hop: int, seconds: float, rng: np.
     period, now = hop / SAMPLE_RATE, time.monotonic() + 1.0
     talks = [client(address, messages, period, seconds, now + rng.uniform(0, period)) for _ in range(streams)]
     return [one for took in await asyncio.gather(*talks) for one in took]
-
-
-def processor_s(process: int) -> float:
-    """Seconds of processor that a process has taken (Linux)."""
-    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def climb(engine: str, seconds: float, rng: np.random.Generator) -> list[dict]:

@@ -2,9 +2,9 @@
 
 soak: so many minutes of audio faster than real time; hour: the same live on virtual devices, with the learner. The sound
 is the bundled conversation over and over. In a soak the reference has a clock that is PPM fast for TURN_S and as much
-slow for the next, so that the alignment has work to do for ever. Memory and processor time per block are read once in each of SLICES, the
-learner's memory each second, of which the slice has the most. The first tenth of the run, a minute at least, is warm-up:
-a shorter run tells only which samples were lost. Exit code 1 where something drifted.
+slow for the next, so that the alignment has work to do for ever. Memory and processor time, per block and of the learner,
+are read once in each of SLICES, the learner's memory each second, of which the slice has the most. The first tenth of the run,
+a minute at least, is warm-up: a shorter run tells only which samples were lost. Exit code 1 where something drifted.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import soundfile
 
 from bench import provenance, results
 from bench.live import virtual_sound
-from bench.live.virtual_sound import children_mb, memory_mb
+from bench.live.virtual_sound import children, memory_mb, processor_s
 from bench.metrics import percentiles
 from bench.recordings import read
 from edgefilter import EgoFilter
@@ -144,13 +144,16 @@ def live(minutes: float, engine: str) -> dict:
         command += ["--profile", DEMO / "profile.npz", "--output", folder / "out.wav", "--json", folder / "stats.json"]
         command += ["--seconds", seconds]
         process = subprocess.Popen(list(map(str, command)), env=server.environment, stderr=subprocess.PIPE, text=True)
-        began, slices, most = time.monotonic(), [], 0.0
+        began, slices, most, before, spent = time.monotonic(), [], 0.0, 0.0, 0.0
         while process.poll() is None:
             time.sleep(min(1.0, seconds / SLICES / 2))
-            elapsed, most = time.monotonic() - began, max(most, children_mb(process.pid))
+            elapsed, learners = time.monotonic() - began, children(process.pid)
+            most = max(most, sum(map(memory_mb, learners)))
             if elapsed * SLICES / seconds > len(slices) + 1 and process.poll() is None:
-                slices.append({"seconds": elapsed, "memory_mb": memory_mb(process.pid), "learner_mb": most})
-                most = 0.0
+                took = sum(map(processor_s, learners)) - spent
+                slices.append({"seconds": elapsed, "memory_mb": memory_mb(process.pid), "learner_mb": most,
+                               "learner_cpu_s_a_minute": 60 * took / (elapsed - before)})  # fmt: skip
+                most, before, spent = 0.0, elapsed, spent + took
         for player in players:
             player.kill()
             player.wait()
@@ -186,6 +189,8 @@ def drifts(found: dict) -> list[str]:
     if "learner_mb" in settled[0]:
         first, second = (max(one["learner_mb"] for one in half) for half in _halves(settled))
         found["learner_growth_mb"] = second - first
+        cpu_s = float(np.mean([one["learner_cpu_s_a_minute"] for one in settled]))
+        found["learner_cpu_s_a_minute_once_settled"] = cpu_s
         if second - first > LEARNER_GROWTH_MB:
             troubles.append(f"the learner's memory grew by {second - first:.1f} MB")
     if "bypass_ms" in settled[0]:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bench import latency
+from edgefilter.errors import UsageError
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +39,15 @@ def test_stages_add_up_to_less_than_the_whole_and_to_most_of_it(runs: dict[str, 
 def test_a_hop_is_timed_beside_a_learner_that_gets_it(runs: dict[str, dict]) -> None:
     learned = runs["linear-learning"]["learned"]
     assert learned["hops"] == 31 + 31 and learned["cpu_s"] > 0 and runs["ss"]["learned"] is None  # warm-up included
+
+
+@pytest.mark.slow
+def test_a_fresh_process_needs_more_than_its_hop_and_less_than_a_minute(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(latency, "STARTS", 1)
+    assert 100 < latency.start_ms() < 60_000
+    monkeypatch.setattr(latency, "BEGIN", "raise SystemExit")
+    with pytest.raises(UsageError, match="no sound in a fresh process"):
+        latency.start_ms()
 
 
 def run(took: float, stages: dict[str, list[float]] | None = None, learned: dict | None = None) -> dict:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +15,7 @@ import soundfile
 from bench import __main__ as bench
 from bench import closed_loop
 from bench.closed_loop import Output
-from bench.live import barge_in, soak
+from bench.live import barge_in, soak, virtual_sound
 from bench.live.barge_in import early_errors, lasts, lowered, muted, silent_at, words
 from bench.metrics import first_sound
 from bench.recogniser import Recogniser
@@ -73,6 +76,18 @@ def test_half_a_minute_of_audio_does_not_drift(tmp_path: Path) -> None:
     assert "nothing drifted" in page and (tmp_path / "live_soak.png").stat().st_size > 5_000
 
 
+def test_what_the_processes_of_a_process_take_is_counted_with_theirs() -> None:
+    busy = "import time\nwhile time.process_time() < 0.3: pass\nprint(flush=True); input()"
+    code = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {busy!r}])"
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        process.stdout.readline()
+        (own,) = virtual_sound.children(process.pid)
+        assert process.pid in virtual_sound.children(os.getpid()) and own in virtual_sound.children(os.getpid())
+        assert 0.2 < virtual_sound.processor_s(own) < 1.0 and virtual_sound.memory_mb(own) > 1.0
+        process.communicate(b"\n")
+    assert virtual_sound.processor_s(own) == virtual_sound.memory_mb(own) == 0.0 and not virtual_sound.children(own)
+
+
 def test_the_lag_of_the_long_run_comes_back() -> None:
     hours = 3600 * 16000 * np.arange(4)
     np.testing.assert_allclose(soak.ahead(hours), [0, 2880, 0, 2880])  # 50 ppm of an hour's samples
@@ -80,7 +95,11 @@ def test_the_lag_of_the_long_run_comes_back() -> None:
 
 def test_a_leak_lost_samples_and_slowing_down_are_found() -> None:
     def result(learner: bool = False, **changes: object) -> dict:
-        kinds = {"learner_mb": 60.0} if learner else {"p50_ms": 1.0, "p99_ms": 2.0, "bypass_ms": 0.1}
+        kinds = (
+            {"learner_mb": 60.0, "learner_cpu_s_a_minute": 5.0}
+            if learner
+            else {"p50_ms": 1.0, "p99_ms": 2.0, "bypass_ms": 0.1}
+        )
         slices = [{"seconds": 60 * i, "memory_mb": 60.0, **kinds} for i in range(20)]
         return {"samples_in": 100, "samples_out": 100, "lost": 0, "slices": slices, **changes}
 
@@ -102,7 +121,9 @@ def test_a_leak_lost_samples_and_slowing_down_are_found() -> None:
     assert soak.drifts(throttled) == []  # the machine became slower, not the filter
     live = result(learner=True)
     live["slices"][0]["learner_mb"] = 0.0  # it comes when it is called
+    live["slices"][1]["learner_cpu_s_a_minute"] = 20.0  # its first fits
     assert soak.drifts(live) == [] and live["learner_growth_mb"] == 0.0
+    assert live["learner_cpu_s_a_minute_once_settled"] == 5.0
     for one in live["slices"][3::2]:
         one["learner_mb"] += 150.0  # within a round
     assert soak.drifts(live) == []
