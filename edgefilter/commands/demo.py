@@ -26,7 +26,7 @@ from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.budget import DEMO
 from edgefilter.filter.ego_filter import EgoFilter, enhance
 from edgefilter.profile.data import Profile
-from edgefilter.report.text import decibels, headline
+from edgefilter.report.text import decibels, first_sight_line, headline
 from edgefilter.session import filter_blocks
 from edgefilter.types import SAMPLE_RATE, Samples
 
@@ -151,9 +151,9 @@ def _mend(name: str, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     print_result(args, [changed, f"$ edgefilter compare {files}"])
     with progress(f"robot {name}: comparison"):
         recording = Recording(case.mic, case.reference, case.profile)
-        excess_db = recording.compare().excess_db
+        excess_db, seen = recording.compare().excess_db, first_sight_line(recording.at_first_sight())
     excess = f"  its own voice is {decibels(excess_db)} dB over the noise floor after the prediction"
-    print_result(args, [excess, f"$ edgefilter diagnose {files} {made}"])
+    print_result(args, [excess, f"$ edgefilter diagnose {files} {made}", f"  {seen}"])
     with progress(f"robot {name}: diagnosis") as step:
         found = recording.diagnose(progress=step)
         step("fit of what was found, and proof in the running filter")

@@ -112,6 +112,7 @@ def test_hidden_tells_the_story_from_a_robot_that_changed_to_a_filter_that_is_me
     assert made == set(HIDDEN_FILES)
     for part in (
         "edgefilter diagnose --profile",
+        "report.html\n  at first sight linear path ",
         f"{after:.1f} dB with better.npz",
         "what had been changed: late_reverb",
     ):
