@@ -103,6 +103,11 @@ def hear(
     return heard.astype(np.float32), truth
 
 
+def at_another_clock(x: np.ndarray, ppm: int) -> np.ndarray:
+    """The same sound, (n,) float32, on a clock that is slower by ppm: exact, of at most 62 s."""
+    return signal.resample(np.pad(x, (0, 10**6 + ppm - x.size)), 10**6)[: x.size].astype(np.float32)
+
+
 def fan(rng: np.random.Generator, n: int, level: float = 0.002) -> np.ndarray:
     """Low-pass noise of rms level, (n,) float32."""
     x = signal.lfilter([1.0], [1.0, -0.9], rng.standard_normal(n))

@@ -10,12 +10,12 @@ import soundfile
 from scipy import signal
 
 import edgefilter
-from bench.simulate.simulated_robot import warp
 from edgefilter.alignment.aligner import COARSE_MARGIN, Aligner
 from edgefilter.alignment.coarse_lag import CoarseLag
 from edgefilter.engines.linear import Linear
 from edgefilter.filter.canceller import Canceller
 from edgefilter.filter.front_end import FrontEnd
+from tests.alignment.scene import at_another_clock
 from tests.conformance import robot_speech
 from tests.learning.scenes import voice
 
@@ -38,11 +38,6 @@ def heard(x: np.ndarray, path: np.ndarray, lag: int, noise_db: float, seed: int)
     echo = np.concatenate((np.zeros(lag), np.convolve(x, path)))[: x.size]
     noise = np.random.default_rng(seed).standard_normal(x.size) * echo.std() * 10 ** (noise_db / 20)
     return (echo + noise).astype(np.float32)
-
-
-def at_another_clock(x: np.ndarray, ppm: float) -> np.ndarray:
-    """The same sound, (n,), on a clock that is slower by ppm."""
-    return warp(x.astype(np.float64), ppm).astype(np.float32)
 
 
 @pytest.mark.parametrize("lag", [700, 9_000, 23_000])
@@ -148,7 +143,7 @@ def test_the_linear_stage_follows_a_path_without_an_arrival(width, lag, noise_db
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ppm", [80.0, -80.0])
+@pytest.mark.parametrize("ppm", [80, -80])
 @pytest.mark.parametrize("drifting", ["reference", "microphone"])
 def test_clocks_that_drift_are_followed_while_the_lag_is_coarse(drifting, ppm):
     """At a constant lag 4 to 6 dB were removed here; with the true lag and drift 30 to 32 are."""

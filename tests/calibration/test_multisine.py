@@ -12,7 +12,7 @@ import pytest
 import soundfile
 from scipy import fft, signal
 
-from bench.simulate.simulated_robot import draw_loudspeaker, warp
+from bench.simulate.simulated_robot import draw_loudspeaker
 from edgefilter import Profile, calibrate, cli, diagnose, enhance, generate_sweep
 from edgefilter.audio.files import FileSink
 from edgefilter.calibration.multisine import BAND_HZ, SPEECH_DB, calibrate_multisine, generate_multisine, multisine_law
@@ -23,6 +23,7 @@ from edgefilter.errors import CalibrationError
 from edgefilter.filter.residual_echo import LEAKAGE, Residual
 from edgefilter.profile.data import GRID_HZ
 from edgefilter.profile.text import describe
+from tests.alignment.scene import at_another_clock
 from tests.calibration.robot_room import fan, room
 from tests.diagnosis.robot_scene import voice
 
@@ -136,7 +137,7 @@ def test_the_distortion_of_the_bench_loudspeaker_is_that_which_noise_shows(speak
 
 @pytest.mark.slow
 def test_clocks_that_drift_are_straightened_and_said(even):
-    recording = warp(heard_through(room(), bent(PLAYED, 0.5, 0.0)).astype(np.float64), 60.0).astype(np.float32)
+    recording = at_another_clock(heard_through(room(), bent(PLAYED, 0.5, 0.0)), 60)
     profile = calibrate_multisine(PLAYED, recording, QUIET)
     for name in ("even", "noise"):
         straight, drifted = (p.approximation.over_linear_db(name)[-1] for p in (even, profile))
