@@ -9,6 +9,7 @@ import numpy as np
 import soundfile
 
 from edgefilter import EgoFilter, Event, Profile
+from edgefilter.alignment.aligner import COARSE_MARGIN
 from edgefilter.closed_loop import closed_loop
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.types import SAMPLE_RATE, Samples
@@ -60,9 +61,9 @@ def listen(
 
 
 def recorded(mic: Samples, ref: Samples, ask_db: float) -> Robot | None:
-    """A robot that was recorded alone: all of the recording mic (n,) counts as its echo; None where the filter does not find its lag."""
+    """A robot that was recorded alone: all of the recording mic (n,) counts as its echo; None where the filter does not find its lag sharply."""
     ego = EgoFilter(engine="linear")
     ego.process(mic, ref)
     found = ego.stats()["alignment"]
-    late = found["delay_samples"] if found else None
-    return None if late is None else Robot(mic, round(late), ask_db)
+    late, wide = (found["delay_samples"], found["deviation_samples"]) if found else (None, None)
+    return None if late is None or wide == COARSE_MARGIN else Robot(mic, round(late), ask_db)

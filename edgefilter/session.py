@@ -93,14 +93,14 @@ class Verdict:
     def of(cls, progress: Progress, stats: Stats, noticed: int | None, wrong: list[str]) -> Verdict:
         """The verdict on a run that has ended; wrong: what its events said."""
         alignment = stats["alignment"] or {}
-        lag, found = alignment.get("delay_samples"), alignment.get("state") == "coarse"
-        if not wrong and alignment and lag is None and not found and progress.robot_s >= UNFOUND_S:
+        lag = alignment.get("delay_samples")
+        if not wrong and alignment and lag is None and progress.robot_s >= UNFOUND_S:
             wrong = [
                 f"the reference carries {progress.robot_s:.0f} s of sound, and nothing of it is found in the microphone: is it from"
                 " another recording, or was the loudspeaker muted, or were headphones used?"
             ]
         lag_ms = None if lag is None else 1000 * lag / SAMPLE_RATE
-        heard = not alignment or lag is not None or found
+        heard = not alignment or lag is not None
         return cls(progress.lowered_db if heard else None, lag_ms, noticed, tuple(wrong))
 
 

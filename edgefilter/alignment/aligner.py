@@ -203,8 +203,7 @@ class Aligner:
         if self._follows(aligned.state):
             if not aligned.realigned and now < self._next_look:
                 return None
-            sure = CERTAIN / (CERTAIN + 1.0) if aligned.state == "coarse" else aligned.confidence
-            seen, self._next_look = Found.followed(round(aligned.delay), sure, now), now + LOOK
+            seen, self._next_look = Found.followed(round(aligned.delay), aligned.confidence, now), now + LOOK
         if seen is None:
             return None
         self._looks.append(seen)
@@ -249,11 +248,12 @@ class Aligner:
 
     def stats(self) -> AlignmentStats:
         """Delay, drift, how sure both are, state and what happened so far, ready for JSON."""
+        deviation = COARSE_MARGIN if self._coarse else round(self._drift.deviation, 3)
         return {
             "method": "tracking",
             "state": self._state(),
-            "delay_samples": round(self._drift.delay, 3) if self._known else None,
-            "deviation_samples": round(self._drift.deviation, 3) if self._known else None,
+            "delay_samples": round(self._drift.delay, 3) if self._known or self._coarse else None,
+            "deviation_samples": deviation if self._known or self._coarse else None,
             **self._counts,
             "ppm": round(-1e6 * self._drift.slope, 2),
             "probability": round(self._probability, 3),
@@ -262,7 +262,9 @@ class Aligner:
 
     @property
     def _probability(self) -> float:
-        """That the delay is right, 0 to 1."""
+        """That the delay is right, 0 to 1; of a coarse one as much as of a lag that a search is just certain of."""
+        if self._coarse:
+            return CERTAIN / (CERTAIN + 1.0)
         return 1.0 / (1.0 + math.exp(-self._log_odds)) if self._known else 0.0
 
     def _state(self) -> AlignmentState:
@@ -355,7 +357,9 @@ class Aligner:
         ref = self._expected or self._ref
         self._lags.prepare(ref, now, self._expected.start if self._expected else self._open[0].start)
         yield False
-        heard_out = self._open[0].after + int(self._drift.delay) if self._open and self._probability > 0.5 else 0
+        heard_out = (
+            self._open[0].after + int(self._drift.delay) if self._open and self._known and self._log_odds > 0.0 else 0
+        )
         together = self._used if self._responses is not None else self._used[:1]
         self._lags.listen({at: self._mics[at] for at in together}, self._ref.end, heard_out)
         yield False

@@ -175,6 +175,11 @@ def test_the_state_says_that_the_lag_is_coarse_and_a_sharp_arrival_ends_it():
     aligner = Aligner(HOP)
     states = [aligner.step(*pair).state for pair in zip(hops(mic), hops(x), strict=True)]
     assert "coarse" in states
+    for hop in hops(np.zeros(4 * 16_000, np.float32)):
+        aligner.step(hop, hop)
+    stats = aligner.stats()  # no lag was told, and that nothing was found of a recording that ends in silence
+    assert stats["state"] == "idle" and 3_600 - HOP < stats["delay_samples"] < 3_600 + 1_200 + HOP
+    assert (stats["deviation_samples"], stats["probability"]) == (COARSE_MARGIN, 0.99)
     sharp, aligner = np.roll(x, 3_000), Aligner(HOP)
     sharp[:3_000] = 0.0
     states = [aligner.step(*pair).state for pair in zip(hops(sharp), hops(x), strict=True)]
