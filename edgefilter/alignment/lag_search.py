@@ -132,7 +132,7 @@ class LagSearch:
     def listen(self, mics: Mapping[int, DelayBuffer], now: int, since: int) -> None:
         """Take the microphones up to now, but none of it before since; at most a window after `prepare`.
 
-        mics: by number, where the responses are known several; their evidence is summed.
+        mics: by number, where the responses are known several, which `find` compares.
         """
         skipped = min(max(max(since, self._since) - (now - self._window), 0), self._window)
         self._at, self._start = now, self._size - self._window + skipped
