@@ -148,17 +148,16 @@ class Trainer:
         figures = self._figures(averaged, held_out)
         score = -figures["total"]
         self.since = 0 if score > self.best else self.since + 1
-        said = in_stages(self.before, self.step, self.plan.seed, len(items.names))
-        state = {"kind": self.task.kind, "config": self.task.config(), "figures": figures, **said}
+        state = self._state(items) | {"figures": figures}
         if score > self.best:
             self.best = score
-            write_whole(state | {"network": self.average}, self.output / "best.pt")
+            write_whole(state, self.output / "best.pt")
         here = {"step": self.step, "best": self.best, "since": self.since, "seconds": self.seconds}
         here |= {
             "running": self.network.state_dict(),
             "optimisers": [optimiser.state_dict() for optimiser in self.optimisers],
         }
-        write_whole(state | {"network": self.average, "resume": here}, self.output / "last.pt")
+        write_whole(state | {"resume": here}, self.output / "last.pt")
         board.add_scalar("train/total", loss, self.step)
         for name, value in figures.items():
             board.add_scalar(f"validation/{name}", value, self.step)
@@ -166,6 +165,11 @@ class Trainer:
         with (self.output / "log.jsonl").open("a", encoding="utf-8") as log:
             log.write(json.dumps(line | {k: round(v, 5) for k, v in figures.items()}) + "\n")
         tqdm.write(f"step {self.step}: " + ", ".join(f"{name} {value:.4g}" for name, value in figures.items()))
+
+    def _state(self, items: Items) -> dict[str, object]:
+        """What a checkpoint holds of the averaged weights."""
+        said = in_stages(self.before, self.step, self.plan.seed, len(items.names))
+        return {"kind": self.task.kind, "config": self.task.config(), **said, "network": self.average}
 
     def _device(self) -> torch.device:
         return next(self.network.parameters()).device

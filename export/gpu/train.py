@@ -4,10 +4,10 @@
 
 speech.zip is export.gpu.speech's. All that runs is torch, on one GPU where there is one: speech is read once, conversations
 are rendered in batches and put into the device's memory, the oldest make room, and a step sees crops of them with
-export.train's augmentation. Every --every steps, so that it is more often than once a minute, DIR gets weights.pt (the
-averaged weights, export.checkpoint's) and a line in log.jsonl, validated on conversations of the archive's validation
-voices, the same each time. The minutes count from the program's start. --smoke: seconds of data, some steps, on any
-processor. Besides torch it needs numpy, scipy, soundfile, tqdm, tensorboard, lazy-loader, onnx and onnxruntime.
+export.train's augmentation. Every --every steps DIR gets weights.pt (the averaged weights, export.checkpoint's) and a line in
+log.jsonl, validated on conversations of the archive's validation voices, the same each time; weights.pt also each KEEP_S.
+The minutes count from the program's start. --smoke: seconds of data, some steps, on any processor. Besides torch it needs
+numpy, scipy, soundfile, tqdm, tensorboard, lazy-loader, onnx and onnxruntime.
 """
 
 from __future__ import annotations
@@ -18,11 +18,13 @@ import sys
 import tempfile
 import time
 import zipfile
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from edgefilter.errors import EdgefilterError, UsageError
 from export import train
@@ -35,12 +37,14 @@ from export.processes import Processes
 from export.simulate.linear_stage import from_bytes
 from export.simulate.recipe import RECIPES
 from export.tasks import EdgeTask
-from export.trainer import Plan, Trainer
+from export.trainer import Plan, Trainer, write_whole
 
 NEWEST = Path(__file__).parents[2] / "models" / "version2_bands_step36884.pt"
 """The checkpoint that training goes on from."""
 VALIDATION_SEED = 102
 """Of the validation items, whatever the training's seed."""
+KEEP_S = 50.0
+"""A machine that is lent may end at any moment: no more than a minute of training is lost, with the step under way."""
 USUAL = {"--rate": "1e-3", "--batch": "64", "--every": "100", "--steps": "1000000", "--fan-kept": "0.2"}
 """Options of export.train that are others here: those of the shipped network's training, and ends by the clock."""
 SMOKE = {"--batch": "2", "--every": "2", "--steps": "4", "--seconds": "0.45"}
@@ -73,15 +77,29 @@ class Pool(Items):
 
 
 class Keeper(Trainer):
-    """A trainer that puts weights and log where they outlast the machine, at each validation."""
+    """A trainer that puts weights and log where they outlast the machine, at each validation, and the weights each KEEP_S."""
 
     keep: Path
 
+    def train(self, items: Items, held_out: Items) -> Path:
+        self.items, self.kept = items, time.monotonic()
+        return super().train(items, held_out)
+
+    def _one(self, step: int, batch: Mapping[str, Tensor]) -> dict[str, float]:
+        if time.monotonic() - self.kept > KEEP_S:
+            write_whole(self._state(self.items), self.output / "between.pt")
+            self._put("between.pt")
+        return super()._one(step, batch)
+
     def _validate(self, *known: object) -> None:
         super()._validate(*known)
-        shrink(self.output / "last.pt", self.keep / "weights.part")
-        (self.keep / "weights.part").replace(self.keep / "weights.pt")
+        self._put("last.pt")
         shutil.copy(self.output / "log.jsonl", self.keep)
+
+    def _put(self, name: str) -> None:
+        shrink(self.output / name, self.keep / "weights.part")
+        (self.keep / "weights.part").replace(self.keep / "weights.pt")
+        self.kept = time.monotonic()
 
 
 def arguments(argv: list[str] | None) -> tuple[argparse.Namespace, list[str]]:

@@ -251,6 +251,22 @@ def test_the_minutes_of_a_gpu_in_miniature(archive, tmp_path):
     assert not torch.equal(before, after) and torch.allclose(before, after, atol=0.05)  # it went on from there
 
 
+@pytest.mark.slow
+def test_weights_are_kept_by_the_clock_however_long_the_next_validation_takes(archive, tmp_path, monkeypatch):
+    monkeypatch.setattr(train, "KEEP_S", 0.0)
+    steps = []
+
+    def put(keeper, name):
+        kept.__get__(keeper)(name)
+        steps.append((name, load(tmp_path / "out" / "weights.pt").training["stages"][-1]["steps"]))
+
+    kept = train.Keeper._put
+    monkeypatch.setattr(train.Keeper, "_put", put)
+    words = ["--speech", str(archive), "--output", str(tmp_path / "out"), "--smoke", "--steps", "3", "--every", "3"]
+    assert train.main(words) == 0
+    assert steps == [("between.pt", 0), ("between.pt", 1), ("between.pt", 2), ("last.pt", 3)]
+
+
 def test_what_is_no_archive_is_refused_in_one_line(tmp_path, capsys):
     (tmp_path / "speech.zip").write_bytes(b"speech")
     words = ["--speech", str(tmp_path / "speech.zip"), "--output", str(tmp_path / "out")]
