@@ -142,6 +142,16 @@ class EchoCanceller:
         """Gain with which the robot should speak now, as of `EgoFilter`, by the first microphone."""
         return self._filters[0].voice_gain
 
+    @property
+    def queued_s(self) -> float:
+        """Seconds of speech that the loudspeaker has been handed and has not played yet, as of `EgoFilter`: whoever knows it says so here."""
+        return self._filters[0].queued_s
+
+    @queued_s.setter
+    def queued_s(self, seconds: float) -> None:
+        for each in self._filters:
+            each.queued_s = seconds
+
     def events(self) -> list[Event]:
         """What happened at the first microphone since the last call, as of `EgoFilter`; its samples are those at 16 kHz."""
         return self._filters[0].events()

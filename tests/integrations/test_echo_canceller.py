@@ -51,6 +51,13 @@ def test_as_many_samples_as_came_in_late_by_what_is_said(rate, sizes):
     np.testing.assert_allclose(out[late + edge :], mic[edge : mic.size - late], atol=1e-4)  # 0.1: 60 dB
 
 
+def test_what_waits_in_the_player_is_told_to_the_filter_of_each_microphone():
+    canceller = EchoCanceller(16000, 2, engine="bypass")
+    assert canceller.queued_s == 0.0
+    canceller.queued_s = 0.25
+    assert [each.queued_s for each in canceller._filters] == [0.25, 0.25] and canceller.queued_s == 0.25
+
+
 @pytest.mark.parametrize("rate", RATES)
 def test_at_another_rate_the_answer_is_8_ms_later_at_most_and_the_page_says_by_how_much(rate):
     late_ms = EchoCanceller(rate, engine="linear").delay_ms
