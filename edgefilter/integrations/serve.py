@@ -45,6 +45,7 @@ class Session:
 
     def __init__(self, form: Form, ego: EgoFilter, limits: Limits) -> None:
         self.form, self.ego, self._limits = form, ego, limits
+        ego.queued_s = form.queued_ms / 1000
         rate, self._now = form.rate, asyncio.get_running_loop().time
         self._to_filter = Resampler(rate, SAMPLE_RATE, form.microphones), Resampler(rate, SAMPLE_RATE)
         self._pace = Pace(self._now)

@@ -76,7 +76,8 @@ class Form:
     each message of one stream, with a HEADER. microphones: of an array, interleaved, in "stereo" before the reference.
     codec: "pcm", 16 bit, or "opus", mono, at a rate of 48000 and in two streams. late_ms: how long the microphone waits
     for a late reference. learn: whether to learn the room. bitrate: bits a second of the answer in Opus. output: which
-    of the filter's sounds is the answer. ask_db: as of `BargeInSettings`, whole dB.
+    of the filter's sounds is the answer. ask_db: as of `BargeInSettings`, whole dB. queued_ms: from
+    when the microphone has heard a sound until the loudspeaker plays with the gain that the answer asks for.
     """
 
     rate: int = SAMPLE_RATE
@@ -88,6 +89,7 @@ class Form:
     bitrate: int = 24000
     output: SoundFor = "recognise"
     ask_db: int = 0
+    queued_ms: int = 0
 
     @classmethod
     def of(cls, text: str | bytes) -> Form:
@@ -107,6 +109,7 @@ class Form:
             "bitrate": range(6000, 128001),
             "output": get_args(SoundFor),
             "ask_db": range(41),
+            "queued_ms": range(2001),
         }
         for name, value in given.items():
             allowed = bounds.get(name)

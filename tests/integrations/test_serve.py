@@ -158,8 +158,13 @@ def test_a_client_gets_the_sound_that_it_asks_for(conversation):
 def test_a_client_whose_player_lowers_its_voice_is_told_the_gain(conversation):
     mic, ref = (x[: 13 * RATE].copy() for x in conversation[:2])
     ref[7 * RATE :] = np.roll(ref[7 * RATE :], 3200)  # its lag of 350 ms is too long to hear the lower voice in time
-    for ask_db, gains in ((0, []), (12, ["0.251", "1.000"])):
-        _, told = run(heard({"ask_db": ask_db}, stereo_messages(mic, ref)))
+    asked = {"ask_db": 12}
+    for hello, gains in (
+        ({}, []),
+        (asked, ["0.251", "1.000"]),
+        ({**asked, "queued_ms": 300}, []),
+    ):  # then it is heard too late
+        _, told = run(heard(hello, stereo_messages(mic, ref)))
         assert [each["detail"] for each in told if each["kind"] == "voice_gain"][:2] == gains
         assert "speech_started" in kinds(told)
 
@@ -301,6 +306,7 @@ def test_a_first_message_needs_to_say_nothing():
         ('{"volume": 3}', "'volume', expected rate, streams"),
         ('{"codec": "opus"}', "codec opus needs two streams"),
         ('{"ask_db": 41}', "ask_db 41, expected 0 to 40"),
+        ('{"queued_ms": 2001}', "queued_ms 2001, expected 0 to 2000"),
         ('{"output": "hear"}', "output 'hear', expected recognise or listen"),
         ('{"late_ms": 5000}', "late_ms 5000, expected 0 to 2000"),
     ],
