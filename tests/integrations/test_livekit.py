@@ -20,10 +20,11 @@ class Sink(io.AudioOutput):
 
     def __init__(self):
         super().__init__(label="sink", capabilities=io.AudioOutputCapabilities(pause=True), sample_rate=24_000)
-        self.asked = []
+        self.asked, self.heard = [], []
 
     async def capture_frame(self, frame):
         await super().capture_frame(frame)
+        self.heard.append(from_pcm16(frame.data.cast("B")))
         self.asked.append(frame.samples_per_channel)
 
     def flush(self):
@@ -118,6 +119,15 @@ def test_the_tap_hands_everything_on_and_notes_what_is_played_paused_and_dropped
     asyncio.run(talk())
     assert sink.asked == [24_000, "flush", "pause", "resume", "clear"]
     assert ears.duplex.queued_s == 0 and ears.duplex.stats()["dropped_s"] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_the_tap_lowers_what_it_hands_on_where_the_filter_asks_for_it_and_so_is_the_reference(ears, monkeypatch):
+    monkeypatch.setattr(EgoFilter, "voice_gain", 0.25)
+    played, sink = [], Sink()
+    monkeypatch.setattr(ears.duplex, "play_pcm16", lambda pcm, rate, channels: played.append(from_pcm16(pcm)))
+    asyncio.run(ears.tap(sink).capture_frame(frame_of(NOISE[:2400])))
+    np.testing.assert_allclose(sink.heard[0][240:], 0.25 * NOISE[240:2400], atol=1e-4)  # it fades for 10 ms
+    np.testing.assert_array_equal(played, sink.heard)
 
 
 def test_after_a_pause_the_speech_that_the_room_had_thrown_away_is_no_reference(ears):

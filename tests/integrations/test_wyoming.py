@@ -379,6 +379,20 @@ def test_a_loudspeaker_that_is_not_there_silences_nothing_else(caplog):
     assert "cannot be reached" in caplog.text and service.duplex.queued_s == 0
 
 
+def test_what_the_loudspeaker_gets_is_lowered_where_the_filter_asks_for_it_and_so_is_the_reference(monkeypatch):
+    monkeypatch.setattr(EgoFilter, "voice_gain", 0.25)
+    service, sent, played = EgoService("true", NOBODY, EgoFilter(engine="linear")), [], []
+
+    async def write(chunk):
+        sent.append(from_pcm16(chunk.audio))
+
+    monkeypatch.setattr(service.player, "write", write)
+    monkeypatch.setattr(service.duplex, "play_pcm16", lambda pcm, rate, channels: played.append(from_pcm16(pcm)))
+    asyncio.run(service.say(AudioChunk(RATE, 2, 1, as_pcm16(NOISE))))
+    np.testing.assert_allclose(sent[0][160:], 0.25 * NOISE[160:], atol=1e-4)  # it fades for 10 ms
+    np.testing.assert_array_equal(played, sent)
+
+
 def test_stereo_speech_on_a_mono_loudspeaker_is_the_mean_of_its_channels_and_not_clipped(player, tmp_path):
     loud, both = np.full(10_000, 0.8, np.float32), np.tile(np.float32([0.9, 0.7]), 10_000)
 
