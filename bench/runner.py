@@ -16,6 +16,7 @@ from bench.cache import Cache
 from bench.metrics import CachedMetrics, facts
 from bench.recogniser import Recogniser
 from bench.recordings import Clip, NotHere
+from bench.spread import spread
 from edgefilter.errors import EdgefilterError
 from edgefilter.filter.budget import versions
 
@@ -45,8 +46,6 @@ def run(
     if jobs == 1 and not scheduler:
         made = (_work(setup, task) for task in tasks)
     else:
-        from export.spread import spread  # the training side is not installed everywhere
-
         made = spread(_work, setup, tasks, jobs, scheduler)
     done = dict(tqdm(made, total=len(tasks), unit="clip", disable=not sys.stderr.isatty()))
     return [row for clip in clips for row in done[clip.name]]

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import onnxruntime
 
+from bench import d_vector
 from bench.recordings import NotHere
 from edgefilter.dsp.stft import Analyser, StftConfig, Synthesiser
 from edgefilter.errors import UsageError
@@ -30,16 +31,12 @@ def find(model: Path | None = None) -> Path:
     model = model or MODEL
     if not model.is_file():
         raise NotHere(f"no {model.name} in {model.parent.name}/: train one with python -m export.voicefilter")
-    from export import d_vector  # the training side is not installed everywhere
-
     d_vector.find()
     return model
 
 
 def keep(samples: Samples, voice: Samples, model: Path | None = None) -> Samples:
     """What samples (n,) hold of the speaker of voice (m,), (n,)."""
-    from export import d_vector
-
     session, stft = _open(find(model))
     frames = analysed(stft, samples)
     try:

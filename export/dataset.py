@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from bench.spread import spread
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.errors import EdgefilterError
 from edgefilter.profile.data import Profile
@@ -33,7 +34,6 @@ from export.simulate.conversation import Conversation, simulate
 from export.simulate.linear_stage import front_end, listen
 from export.simulate.material import Material, read_noises, read_responses
 from export.simulate.recipe import RECIPES, Recipe
-from export.spread import spread
 
 ROOMS = {"lab": 1 / 3, "office": 1 / 2, "hall": 1 / 6}
 """Shares of the kinds of room."""

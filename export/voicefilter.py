@@ -19,10 +19,10 @@ from pathlib import Path
 
 import torch
 
+from bench.d_vector import d_vector
 from edgefilter.errors import EdgefilterError
 from export.corpus import read_corpus
 from export.crops import Shape
-from export.d_vector import d_vector
 from export.onnx_export import load
 from export.trainer import Plan
 from export.voicefilter_mixtures import Mixtures, Voices, read_items

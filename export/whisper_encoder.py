@@ -17,8 +17,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv1d, gelu, layer_norm, linear, scaled_dot_product_attention
 
+from bench.mel import mel_filters
 from edgefilter.errors import EdgefilterError, ModelError
-from export.mel import mel_filters
 
 N_FFT, HOP = 400, 160
 """Of Whisper's spectra, 25 and 10 ms (Radford et al. 2022, section 2.2)."""

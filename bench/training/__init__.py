@@ -1,11 +1,11 @@
 r"""What chooses a network, on validation speakers and voices, never on test ones.
 
-    python -m bench training words --checkpoints RUN/last.pt [...] --conversations VALIDATION/paper VALIDATION/live \
+    python -m bench training words --networks RUN/last.onnx [...] --conversations VALIDATION/paper VALIDATION/live \
         --cold --real RECORDINGS --speech HUMAN/val --whisper WHISPER --output PATH
     python -m bench training probability --real RECORDINGS --speech HUMAN/val \
         --conversations VALIDATION/paper VALIDATION/live --every 3 --output PATH
 
-words: which checkpoint keeps the words. probability: the scale and bias by which the speech head's probability is one.
+words: which network of export.onnx_export keeps the words. probability: the scale and bias by which the speech head's probability is one.
 What each does stands at the head of its file in bench/training/. RECORDINGS: of a device of many recordings the half
 that is to tune on.
 """
@@ -20,7 +20,7 @@ from bench.recordings import Recording, find_recordings
 from edgefilter.errors import UsageError
 
 PARTS = ("words", "probability")
-"""Modules of this folder; the first needs torch, so that each is imported where it runs."""
+"""Modules of this folder, each imported where it runs."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--real", type=Path, metavar="DIR", help="recordings of real devices, the robot alone")
     add("--speech", type=Path, metavar="DIR", help="humans that are laid on them")
     add("--cases", type=int, default=8, metavar="N", help="humans that are laid on them at each level")
-    add("--checkpoints", type=Path, nargs="*", default=[], metavar="FILE.pt", help="words: trained networks")
+    add("--networks", type=Path, nargs="*", default=[], metavar="FILE.onnx", help="words: trained networks")
     add("--cold", action="store_true", help="words: each conversation once more without its profile")
     add("--learning", action="store_true", help="words: the filter learns while it runs")
     add("--wiener", type=float, nargs="*", default=[0.5], metavar="SHARE", help="words: shares of 'ss' in the answer")

@@ -1,4 +1,4 @@
-"""Which checkpoint keeps the words: networks against 'ss' on validation conversations, by what a recogniser makes of them.
+"""Which network keeps the words: networks against 'ss' on validation conversations, by what a recogniser makes of them.
 
 Loss and SI-SDR did not predict word errors, so networks are chosen by these. Every network answers alone, and mixed
 with the Wiener mask of 'ss', with the linear stage's error, and with both (--wiener, --error: shares of the answer),
@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from bench import provenance, recordings, results, runner
 from bench.cache import Cache
@@ -34,7 +33,6 @@ from edgefilter.errors import UsageError
 from edgefilter.filter.stream import Stream, step
 from edgefilter.profile.data import Profile
 from edgefilter.types import Frame, Output, Samples
-from export import onnx_export
 
 REAL = Cells(sers=(-10.0, -20.0), befores=(0.0, 10.0))
 """Of humans laid on real loudspeakers."""
@@ -121,22 +119,16 @@ def answer(engine: Engine, given: list[Frame], samples: int) -> Samples:
     return np.concatenate(hops)[engine.stft.window_length - engine.stft.hop :][:samples]
 
 
-def contenders(
-    checkpoints: Sequence[Path], wiener: Sequence[float], error: Sequence[float], folder: Path
-) -> dict[str, Contender]:
-    """What is compared, by name: linear, ss and crnn as they ship, each checkpoint's averaged weights, alone and mixed."""
+def contenders(networks: Sequence[Path], wiener: Sequence[float], error: Sequence[float]) -> dict[str, Contender]:
+    """What is compared, by name: linear, ss and crnn as they ship, and each network, alone and mixed."""
     code = results.code_digest()
     found = {"linear": Contender(partial(create, "linear"), code)}
     for name in (BASE, "crnn"):
         shipped = "".join(results.digest(path)["sha256"] for path in provenance.models_of([name]).values())
         found |= _with_error(name, Contender(partial(create, name), code + shipped), error)
-    folder.mkdir(parents=True, exist_ok=True)
-    for path in checkpoints:
-        trained = onnx_export.load(path)
-        name = f"{path.parent.name}/{path.stem}, step {trained.training.get('step', '?')}"
-        model = folder / f"{path.parent.name}_{path.stem}.onnx"
-        onnx_export.export(trained, model)
-        identity = code + results.digest(path)["sha256"]
+    for model in networks:
+        name = f"{model.parent.name}/{model.stem}"
+        identity = code + results.digest(model)["sha256"]
         found |= _with_error(name, Contender(lambda _, model=model: Crnn(model), identity), error)
         for share in wiener:
             mixed = Contender(lambda _, m=model, s=share: mix(Crnn(m), SpectralSubtraction, s), identity)
@@ -220,13 +212,12 @@ def tables(rows: Sequence[dict]) -> list[dict]:
 def run(options: argparse.Namespace) -> str:
     if not options.whisper:
         raise UsageError("words need a recogniser: give --whisper")
-    torch.set_num_threads(1)
-    checkpoints = {f"{path.parent.name}/{path.name}": path for path in options.checkpoints}
+    networks = {f"{path.parent.name}/{path.name}": path for path in options.networks}
     data = {"conversations": options.conversations}
     data |= {"RECORDINGS": [options.real], "HUMAN": [options.speech]} if options.real else {}
-    models = {"WHISPER": options.whisper, "SECOND": options.second_whisper, **checkpoints}
+    models = {"WHISPER": options.whisper, "SECOND": options.second_whisper, **networks}
     made_with = provenance.stamp(data, ["linear", BASE, "crnn"], models)
-    making = contenders(options.checkpoints, options.wiener, options.error, options.cache / "checkpoints")
+    making = contenders(options.networks, options.wiener, options.error)
     setup = runner.Setup(options.cache, options.whisper, second_whisper=options.second_whisper)
     cached, kept = runner.cached_metrics(setup), Cache(options.cache, "rows")
     rows: list[dict] = []

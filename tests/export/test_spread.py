@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from distributed import LocalCluster
 
+from bench.spread import spread
 from edgefilter.errors import UsageError
 from export import dataset
-from export.spread import spread
 from tests.export.speech import write_librispeech, write_table
 
 
@@ -31,7 +31,7 @@ def test_processes_and_cluster_answer_the_same(cluster):
 
 
 def test_a_task_that_fails_and_a_scheduler_that_is_not_there_are_said(cluster, monkeypatch):
-    monkeypatch.setattr("export.spread.PATIENCE", "1s")
+    monkeypatch.setattr("bench.spread.PATIENCE", "1s")
     for scheduler in (None, cluster.scheduler_address):
         with pytest.raises(UsageError, match="unlucky"):
             list(spread(power, 2, [13], 1, scheduler))

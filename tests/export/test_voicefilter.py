@@ -13,10 +13,10 @@ import pytest
 import torch
 from onnx import TensorProto, helper, numpy_helper
 
-from bench import systems, voicefilter
+from bench import d_vector, systems, voicefilter
 from bench.recordings import NotHere, conversation_clips
 from edgefilter.errors import ModelError, UsageError
-from export import d_vector, dataset, voicefilter_onnx
+from export import dataset, voicefilter_onnx
 from export import voicefilter as program
 from export.corpus import read_corpus
 from export.crops import Shape

@@ -6,8 +6,8 @@ import pytest
 import torch
 from ctranslate2.specs import whisper_spec
 
+from bench.mel import mel_filters
 from edgefilter.errors import ModelError
-from export.mel import mel_filters
 from export.network import EdgeConfig
 from export.recogniser_loss import RecogniserLoss
 from export.whisper_encoder import HOP, N_FFT, WhisperEncoder, parity, read_weights

@@ -14,7 +14,7 @@ from bench.recordings import Clip, Conversation, Signals
 from bench.training import words
 from edgefilter.engines import create
 from edgefilter.filter.stream import Stream
-from export import train
+from export import onnx_export, train
 from tests.bench.conftest import rows_of
 
 
@@ -56,22 +56,23 @@ def conversation(tmp_path):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A folder of export/train.py."""
+    """A folder of export/train.py, with last.onnx."""
     tmp_path = tmp_path_factory.mktemp("run")
     small = ["--channels", "2", "2", "2", "2", "--hidden", "4", "--smoke"]
     folders = ["--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", str(tmp_path / "tiny")]
     assert train.main([*folders, *small]) == 0
+    assert onnx_export.main([str(tmp_path / "tiny/last.pt"), "--output", str(tmp_path / "tiny/last.onnx")]) == 0
     return tmp_path / "tiny"
 
 
 @pytest.mark.slow
-def test_checkpoints_are_compared_by_words_with_a_profile_and_without_against_ss(tmp_path, run, conversation, whisper):
-    arguments = ["--checkpoints", run / "last.pt", "--conversations", conversation, "--cold", "--whisper", whisper]
+def test_networks_are_compared_by_words_with_a_profile_and_without_against_ss(tmp_path, run, conversation, whisper):
+    arguments = ["--networks", run / "last.onnx", "--conversations", conversation, "--cold", "--whisper", whisper]
     arguments += ["--output", tmp_path / "results" / "training", "--cache", tmp_path / "cache"]
     assert program.main(["training", "words", *map(str, arguments)]) == 0
     part = results.read(tmp_path / "results" / "training.json")["parts"]["words"]
     found = rows_of(part["rows"])
-    tiny = "tiny/last, step 4"
+    tiny = "tiny/last"
     mixed = [name + share for name in ("ss", "crnn", tiny, f"{tiny}, 0.5 ss") for share in ("", ", 0.2 error")]
     assert [row["system"] for row in found] == 2 * ["linear", *mixed]
     assert [row["kind"] for row in found] == 9 * ["conversations lab"] + 9 * ["conversations lab cold"]
@@ -80,7 +81,7 @@ def test_checkpoints_are_compared_by_words_with_a_profile_and_without_against_ss
     assert by_name["ss"] == pytest.approx(by_name[tiny], abs=0.1)  # after four steps it is still nearly 'ss'
     assert by_name["crnn"] != by_name[tiny]
     assert all(by_name[name] != by_name[f"{name}, 0.2 error"] for name in ("crnn", tiny))  # the share is another answer
-    assert "| tiny/last, step 4 | 50 | 50 | 0 | 0.0 |" in (tmp_path / "results" / "training.md").read_text()
+    assert "| tiny/last | 50 | 50 | 0 | 0.0 |" in (tmp_path / "results" / "training.md").read_text()
 
 
 @pytest.mark.slow
@@ -94,7 +95,7 @@ def test_what_is_known_is_not_run_again(tmp_path, run, conversation, whisper, mo
 
     first, ran, answer = compare("first"), [], words.answer
     monkeypatch.setattr(words, "answer", lambda *given: ran.append(1) or answer(*given))
-    second = compare("second", "--checkpoints", run / "last.pt")
+    second = compare("second", "--networks", run / "last.onnx")
     assert len(ran) == 1 and second[:3] == first and len(second) == 4
 
 

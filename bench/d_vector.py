@@ -15,9 +15,9 @@ import numpy as np
 import onnxruntime
 from scipy import signal
 
+from bench.mel import mel_filters
 from edgefilter.errors import UsageError
 from edgefilter.types import Array, Samples
-from export.mel import mel_filters
 
 SIZE = 256
 """Values of a d-vector."""
