@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 import soundfile
 
+from docs.draw_belief import CELL, believed, draw
+from edgefilter.alignment.aligner import LATEST
 from edgefilter.session import level_db as db
 from edgefilter.types import SAMPLE_RATE as RATE
 from tests.program import DEMO, ROOT, argv
@@ -33,6 +35,17 @@ def run(name, *words, stdin=None):
 
 def read(path):
     return soundfile.read(path, dtype="float32")[0]
+
+
+def test_the_picture_of_the_lag_shows_the_one_at_which_the_robot_is_heard(tmp_path):
+    """It drew odds of its own, at lags that were wrong by two seconds, and failed on recordings with a lag that is long."""
+    mic, reference = (read(DEMO / f"{name}.flac")[: 4 * RATE] for name in ("mic", "reference"))
+    first = believed(np.pad(mic, (4 * RATE - 2288, 0))[: 8 * RATE], np.pad(reference, (0, 4 * RATE)))  # 4 s late
+    assert first.max(axis=1).argmax() == (4 * RATE + LATEST) // CELL and first.max() > 0.99
+    for name, sound in (("mic", mic), ("reference", reference)):
+        soundfile.write(tmp_path / f"{name}.flac", sound, RATE)
+    draw([str(tmp_path / "mic.flac"), str(tmp_path / "reference.flac")], tmp_path / "belief.png")
+    assert (tmp_path / "belief.png").stat().st_size > 10_000
 
 
 @pytest.fixture(scope="module")
