@@ -203,7 +203,7 @@ def _draw_mended(
     if not html or not plots:
         return []
     names = {"profile": "robot.npz", "recording": "mic.wav", "reference": "tts.wav", "apply": "better.npz"}
-    page = html.diagnosis_page(recording, applied.found, names, applied.facts())
+    page = html.diagnosis_page(recording, applied.found, names, applied.facts(), applied.proof)
     html.write_page(folder / "report.html", page)
     sounds = {
         "microphone: the robot talks, and a human interrupts it": case.talk,

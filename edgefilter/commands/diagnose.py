@@ -84,8 +84,8 @@ def main(args: argparse.Namespace) -> None:
     print_result(args, lines, {**found.to_dict(), **more})
     if html:
         with progress("page of the diagnosis"):
-            outcome = applied.facts() if applied else ()
-            html.write_page(args.report, html.diagnosis_page(recording, found, vars(args), outcome))
+            outcome, proof = (applied.facts(), applied.proof) if applied else ((), found.proof)
+            html.write_page(args.report, html.diagnosis_page(recording, found, vars(args), outcome, proof))
         print_result(args, [f"report      {args.report}"])
     if refused:
         raise refused

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -41,7 +41,8 @@ class Proof:
     """ERLE (dB) of the running filter, engine linear, over seconds that no fit has seen, without and with the effects.
 
     seconds: of the robot alone that were tested on, from start_s to the recording's end. without: of several effects,
-    the ERLE with all but that one, where they make the filter worse; empty otherwise.
+    the ERLE with all but that one, where they make the filter worse; empty otherwise. left_before, left_after: what the
+    filter gives of these seconds, (n,).
     """
 
     effects: tuple[str, ...]
@@ -49,6 +50,8 @@ class Proof:
     seconds: float
     erle_before_db: float
     erle_after_db: float
+    left_before: Samples = field(repr=False, compare=False)
+    left_after: Samples = field(repr=False, compare=False)
     without: tuple[tuple[str, float], ...] = ()
 
     @property
@@ -62,8 +65,9 @@ class Proof:
         return max(self.without, key=lambda entry: entry[1])[0] if self.without else None
 
     def to_dict(self) -> dict[str, object]:
-        """Ready for JSON."""
-        return {**rounded(asdict(self), 3), "without": rounded(dict(self.without), 3), "worse": self.worse}
+        """All but the sound, ready for JSON."""
+        told = {entry.name: rounded(getattr(self, entry.name), 3) for entry in fields(self) if entry.repr}
+        return {**told, "without": rounded(dict(self.without), 3), "worse": self.worse}
 
 
 class HeldOut:
@@ -96,10 +100,13 @@ class HeldOut:
         A filter that begins with the rest, engine "linear", runs over it with the profile before and after. Where somebody
         else talks is left out.
         """
-        proof = Proof(tuple(names), self.cut / SAMPLE_RATE, self.seconds, self._erle_before_db, self._erle_with(names))
+        before, after = self._left_before, self._left_with(names)
+        erle_db = self._erle_db(before), self._erle_db(after)
+        proof = Proof(tuple(names), self.cut / SAMPLE_RATE, self.seconds, *erle_db, before, after)
         if not proof.worse or len(names) < 2:
             return proof
-        return replace(proof, without=tuple((name, self._erle_with([n for n in names if n != name])) for name in names))
+        others = ((name, self._left_with([n for n in names if n != name])) for name in names)
+        return replace(proof, without=tuple((name, self._erle_db(left)) for name, left in others))
 
     def until_kept(self, names: Sequence[str]) -> tuple[Proof, ...]:
         """The proof of all names, then without the one that does most harm, while there is one: the last names what is kept."""
@@ -109,18 +116,20 @@ class HeldOut:
         return tuple(proofs)
 
     @cached_property
-    def _erle_before_db(self) -> float:
-        return self.erle_db(self._profile)
+    def _left_before(self) -> Samples:
+        return self._left(self._profile)
 
-    def _erle_with(self, names: Sequence[str]) -> float:
-        return self.erle_db(with_fitted(self._first, self._early, names)[0])
+    def _left_with(self, names: Sequence[str]) -> Samples:
+        return self._left(with_fitted(self._first, self._early, names)[0])
 
-    def erle_db(self, profile: Profile | None) -> float:
-        """ERLE of the running filter with that profile over the held-out seconds of the robot alone, dB."""
-        measurement = self._prepared.measurement
-        heard = measurement.recording[self.cut :]
-        said = np.pad(measurement.reference, (0, AHEAD))[self.cut + AHEAD :]
-        left = enhance(heard, said, profile, engine="linear")
+    def _left(self, profile: Profile | None) -> Samples:
+        """What the running filter with that profile gives of the held-out seconds, (n,)."""
+        said = np.pad(self._prepared.measurement.reference, (0, AHEAD))[self.cut + AHEAD :]
+        return enhance(self._prepared.measurement.recording[self.cut :], said, profile, engine="linear")
+
+    def _erle_db(self, left: Samples) -> float:
+        """ERLE over the seconds of the robot alone, dB."""
+        heard = self._prepared.measurement.recording[self.cut :]
         before, after = (decibels(np.sum(np.square(x[self._tested], dtype=np.float64))) for x in (heard, left))
         return float(before - after)
 

@@ -17,6 +17,7 @@ from edgefilter.audio.files import whole
 from edgefilter.diagnosis.compare import Comparison, describe
 from edgefilter.diagnosis.laws import Law
 from edgefilter.diagnosis.passport import ENOUGH_DB, Passport
+from edgefilter.diagnosis.proof import Proof
 from edgefilter.diagnosis.recording import Recording
 from edgefilter.diagnosis.result import Diagnosis, Finding, Precision, in_order
 from edgefilter.diagnosis.straightened import Straightened
@@ -31,6 +32,30 @@ LOUDER = 10.0
 dB)."""
 MAX_FREE = 3
 """Up to so many effects every subset is computed; of more only those that leave out the last ones."""
+TERMS = {
+    "budget": {
+        "Noise floor": "the fan alone; dBFS are decibels of full scale.",
+        "Irreducible": "noise that the robot makes or its stream adds. Its level follows the voice; its waveform nothing predicts.",
+    },
+    "spectra": {
+        "Prediction": "what the profile, and each effect that is switched on, make of the reference, the sound that was played.",
+        "ERLE": "by how many decibels the running filter lowers the robot while it talks alone.",
+    },
+    "where": {
+        "Excess": "power of recording minus prediction over the fan's, both through a filter that makes the fan white. Lag and"
+        " what the fan does by itself are no error.",
+        "Lag": "how much later than the reference a sound comes: the first arrival at once, a room for a second.",
+    },
+    "found": {"By chance": "how often a recording in which nothing is missing shows as much of the effect."},
+    "statistics": {
+        "White": "of the same power at all frequencies, as the fan is behind its filter: one sample tells nothing of the next."
+    },
+    "known": {"Standard error": "the true value is nearer than this in two of three recordings."},
+    "tried": {
+        "Held out": "every second half second: no fit has used it, so that an effect that is not there gains nothing."
+    },
+}
+"""What the page's words mean, by the section that they stand beside."""
 
 Choice = tuple[bool, ...]
 
@@ -51,10 +76,12 @@ def diagnosis_page(
     found: Diagnosis,
     names: Mapping[str, Any],
     outcome: Sequence[tuple[str, str, str]] = (),
+    proof: Proof | None = None,
 ) -> str:
     """The page of a diagnosis, with a switch for each found effect.
 
-    recording: what was diagnosed. outcome: further figures at the top, where a profile was written.
+    recording: what was diagnosed. outcome: further figures at the top, where a profile was written. proof: what the running
+    filter makes of it, to listen to.
     """
     steps = in_order(found.ranking)
     variants = compare_variants(recording.straightened, found.model, steps)
@@ -69,7 +96,7 @@ def diagnosis_page(
         "law": _law(found.law),
         **_statistics(found),
     }
-    return _page(variants, steps, fields, names, found.irreducible_db, outcome)
+    return _page(variants, steps, fields, names, found.irreducible_db, outcome, proof)
 
 
 def passport_page(found: Passport, diagnosis: str, names: Mapping[str, Any]) -> str:
@@ -125,6 +152,7 @@ def _page(
     names: Mapping[str, Any],
     irreducible_db: float | None = None,
     outcome: Sequence[tuple[str, str, str]] = (),
+    proof: Proof | None = None,
 ) -> str:
     before, after = variants[(False,) * len(steps)], variants[(True,) * len(steps)]
     scale, roles = colour_scale(before.recording), ("profile", "recording", "reference")
@@ -132,6 +160,8 @@ def _page(
         **fields,
         **{role: Path(str(names[role] or "none: the recording itself")).name for role in roles},
         "facts": [*_facts(before, after if steps else None, irreducible_db), *outcome],
+        "proven": text.proof_line(proof, "").removeprefix("proof").strip() if proof else "",
+        "terms": TERMS,
         "switches": [text.title(finding.effect) for finding in steps],
         "notes": _notes(before),
         "seconds": f"{before.recording.size / SAMPLE_RATE:.1f}",
@@ -140,7 +170,7 @@ def _page(
         "bottom": f"{scale[0]:.0f}",
         "top": f"{scale[1]:.0f}",
         "free": "" if len(steps) <= MAX_FREE else "Later effects build on earlier ones and are switched with them.",
-        "data": _data(variants, before, irreducible_db or 0.0, scale),
+        "data": _data(variants, before, irreducible_db or 0.0, scale, proof),
     }
     return _rendered("page.html", fields)
 
@@ -158,7 +188,11 @@ def _rendered(name: str, fields: Mapping[str, object]) -> str:
 
 
 def _data(
-    variants: Mapping[Choice, Comparison], before: Comparison, irreducible_db: float, scale: tuple[float, float]
+    variants: Mapping[Choice, Comparison],
+    before: Comparison,
+    irreducible_db: float,
+    scale: tuple[float, float],
+    proof: Proof | None,
 ) -> dict:
     """What the program draws; pictures and sounds that occur twice are held once."""
     gain = 10 ** (-1 / 20) / max(float(abs(before.recording).max()), 1e-6)
@@ -175,6 +209,12 @@ def _data(
         "louder": LOUDER,
         "human": before.human,
         "recording": kept(before.recording, gain),
+        "filtered": proof
+        and {
+            "from_s": proof.start_s,
+            "before": kept(proof.left_before, gain),
+            "after": kept(proof.left_after, gain),
+        },
         "variants": {
             "".join("01"[on] for on in choice): {
                 "excess_db": round(found.excess_db, 3),

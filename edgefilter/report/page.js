@@ -129,25 +129,26 @@ function timeTicks() {
 }
 
 /* Spectrograms and players. */
-function drawSpectrogram(id, what, words) {
+function drawSpectrogram(id, what, words, from = 0) {
+  const place = (s) => (100 * (s - from)) / (data.seconds - from);
   const figure = document.getElementById(id);
   const frame = figure.querySelector(".frame");
   if (!frame.firstChild) {
     const plot = put(frame, "plot");
     plot.append(document.createElement("img"));
-    data.human.forEach(([from, to]) => {
-      put(plot, "talk", { left: (100 * from) / data.seconds, width: (100 * (to - from)) / data.seconds }).title = "somebody talks";
+    data.human.forEach(([start, end]) => {
+      put(plot, "talk", { left: place(start), width: place(end) - place(start) }).title = "somebody talks";
     });
     const cursor = put(plot, "cursor", { left: 0, display: "none" });
     [0, 2, 4, 6, 8].forEach((khz) => put(frame, "tick", { bottom: (100 * khz) / 8 }, khz === 8 ? "8 kHz" : `${khz}`));
     const audio = figure.querySelector("audio");
     audio.addEventListener("timeupdate", () => {
       cursor.style.display = audio.currentTime > 0 ? "" : "none";
-      cursor.style.left = `${(100 * audio.currentTime) / data.seconds}%`;
+      cursor.style.left = `${place(from + audio.currentTime)}%`;
     });
   }
   frame.querySelectorAll(".under").forEach((old) => old.remove());
-  ticks(frame, timeTicks(), (x) => (100 * x) / data.seconds, "s");
+  ticks(frame, timeTicks().filter((s) => s >= from), place, "s");
   const image = figure.querySelector("img");
   image.src = data.media[what.picture];
   image.alt = `Spectrogram, ${words}`;
@@ -221,6 +222,7 @@ function draw() {
   drawSpectrogram("recording", data.recording, "recording");
   drawSpectrogram("prediction", now.prediction, "prediction");
   drawSpectrogram("residual", now.residual, `what is left, ${db(now.excess_db)} over the noise floor`);
+  if (data.filtered) ["before", "after"].forEach((id) => drawSpectrogram(id, data.filtered[id], `${id} the effects, filtered`, data.filtered.from_s));
   drawCorrelogram("auto", now.correlations?.auto);
   drawCorrelogram("cross", now.correlations?.cross);
   drawTables(now);

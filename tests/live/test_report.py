@@ -57,7 +57,10 @@ def pages(tmp_path_factory):
     y = record(x, wrong)
     found = diagnose(robot, y, x, criteria=Criteria(false_rate=0.05))  # a distortion that is near the floor
     assert [finding.effect for finding in found.ranking] == ["playback_gain", "speaker_nonlinearity"]
-    write_page(folder / "missing.html", diagnosis_page(Recording(y, x, robot), found, NAMES))
+    recording = Recording(y, x, robot)
+    write_page(folder / "missing.html", diagnosis_page(recording, found, NAMES))
+    proof = recording.prove([finding.effect for finding in found.ranking])
+    write_page(folder / "proved.html", diagnosis_page(recording, found, NAMES, proof=proof))
     write_page(folder / "comparison.html", comparison_page(found.comparison, NAMES))
     neutral = [Finding(name, "dynamics", 1.0, 0.0, 0.0, 0.0, {}, "", {}, y) for name in ("compression", "clock_drift")]
     model = found.model.with_effect("compression", {}).with_effect("clock_drift", {})
@@ -143,6 +146,16 @@ def test_it_is_worked_without_a_mouse(browser, pages):
     assert browser.run(unnamed) == 0
 
 
+def test_what_the_running_filter_leaves_is_drawn_and_played_from_where_it_begins(browser, pages):
+    folder, _ = pages
+    browser.open(folder / "proved.html", 1280)
+    browser.wait("[...document.querySelectorAll('audio')].every((a) => a.readyState >= 1)")
+    before, after = browser.run("['before', 'after'].map((id) => document.querySelector(`#${id} audio`).duration)")
+    begins = browser.run("data.filtered.from_s")
+    assert before == after == pytest.approx(6.0 - begins, abs=0.1)  # Opus pads to whole packets
+    assert float(browser.run("document.querySelector('#after .under').textContent")) >= begins
+
+
 def test_sound_plays_and_the_residual_is_at_its_true_level(browser, pages):
     folder, found = pages
     browser.open(folder / "missing.html", 1280)
@@ -158,7 +171,7 @@ def test_sound_plays_and_the_residual_is_at_its_true_level(browser, pages):
 
 
 @pytest.mark.parametrize("width", [360, 768, 1280])
-@pytest.mark.parametrize("page", ["missing", "many", "comparison", "explained"])
+@pytest.mark.parametrize("page", ["missing", "proved", "many", "comparison", "explained"])
 def test_nothing_is_clipped_or_overlaps_at_any_width(browser, pages, page, width):
     folder, _ = pages
     browser.open(folder / f"{page}.html", width)

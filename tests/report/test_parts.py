@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import base64
 import io
+import json
+import re
 from dataclasses import replace
+from importlib import resources
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,11 +21,11 @@ from edgefilter.diagnosis.recording import Recording, compare
 from edgefilter.diagnosis.result import Diagnosis, Finding, Interval
 from edgefilter.echo.effects.catalogue import EFFECTS, find
 from edgefilter.report import text
-from edgefilter.report.html import choices, compare_variants, diagnosis_page
+from edgefilter.report.html import TERMS, choices, compare_variants, diagnosis_page
 from edgefilter.report.media import LEVELS, MAX_COLUMNS, colour_scale, colours, sound, spectrogram_db, spectrogram_png
 from edgefilter.report.text import LINES, add_command, coarser, comparison_summary, diagnosis_lines, summary_lines
 from edgefilter.types import SAMPLE_RATE as RATE
-from tests.diagnosis.robot_scene import profile, record, voice
+from tests.diagnosis.robot_scene import office, profile, record, voice
 
 
 def content(address: str) -> io.BytesIO:
@@ -209,6 +212,30 @@ def test_what_no_waveform_predicts_does_not_stand_beside_what_the_findings_leave
     assert not any("irreducible" in line for line in told) and any(
         line.startswith("left        8.0 of ") for line in told
     )
+
+
+def test_what_the_running_filter_leaves_before_and_after_is_in_the_page_to_listen_to():
+    x, robot = voice(6.0), profile()
+    recording = Recording(record(x, office()), x, robot)
+    proof = recording.prove("late_reverb")
+    found = Diagnosis("missing", recording.compare(), (), "", 0.3, 0.0, robot.echo)
+    names = {"profile": "p", "recording": "m", "reference": "r"}
+    page = diagnosis_page(recording, found, names, proof=proof)
+    data = json.loads(page.split('id="data">')[1].split("</script>")[0])
+    before, after = (
+        soundfile.read(content(data["media"][data["filtered"][key]["sound"]]))[0] for key in ("before", "after")
+    )
+    assert np.mean(after**2) < 0.5 * np.mean(before**2) and proof.erle_after_db > proof.erle_before_db + 3.0
+    assert data["filtered"]["from_s"] == proof.start_s and "What the running filter leaves" in page
+    assert "What the running filter leaves" not in diagnosis_page(recording, found, names)
+    assert "left_before" not in proof.to_dict()
+
+
+def test_each_section_of_the_page_has_its_words_explained_once_and_beside_it():
+    page = resources.files("edgefilter.report").joinpath("page.html").read_text()
+    assert re.findall(r'glossary\("(\w+)"\)', page) == list(TERMS)
+    words = [term for section in TERMS.values() for term in section]
+    assert len(words) == len(set(words)) >= 8
 
 
 @pytest.mark.slow
