@@ -35,12 +35,11 @@ REACH = Reach(
 
 
 class MultibandCompression(Effect):
-    """The sum of three compressors, each on one band.
+    """y = sum_k C_k(h_k * x(n - delay)), C_k a compressor as of `compression`, h_1 to h_3 three bands from low to high.
 
-    The bands are cut by crossovers of fourth order whose outputs are in phase (Linkwitz 1976), so that their sum has the
-    reference's spectrum but not its phase: that, too, is the effect's. threshold_db, ratio, makeup_db: (3,) from low to
-    high, of compressors as of `compression`; attack_ms and release_ms are those of all. delay: of the whole, in whole
-    samples, re the lag at which a recording is found, which is that of its loudest band.
+    h_k: crossovers of fourth order, in phase with each other, |sum_k H_k| = 1 (Linkwitz 1976); the phase of that sum is the
+    effect's, too. threshold_db, ratio, makeup_db: (3,); attack_ms, release_ms: of all. delay: in whole samples, re the lag
+    at which a recording is found, which is that of its loudest band.
     """
 
     name = "multiband_compression"

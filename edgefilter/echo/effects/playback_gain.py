@@ -10,7 +10,7 @@ from edgefilter.types import Samples
 
 
 class PlaybackGain(Effect):
-    """One gain for all frequencies, before the loudspeaker."""
+    """y = 10^(gain_db / 20) x, before the loudspeaker."""
 
     name = "playback_gain"
     stage = "source"
