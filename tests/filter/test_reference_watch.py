@@ -17,8 +17,8 @@ from edgefilter.filter.playback_faults import AHEAD, BEHIND, CHANCE, LENGTH, spe
 from edgefilter.filter.reference_watch import ReferenceWatch
 from edgefilter.filter.removal import Removal
 from edgefilter.profile.data import Profile
+from edgefilter.types import PRE_ROLL, SET_UP_WRONG, Frame
 from edgefilter.types import SAMPLE_RATE as RATE
-from edgefilter.types import SET_UP_WRONG, Frame
 from tests.program import DEMO, demo
 
 LAG = 2288
@@ -73,6 +73,35 @@ def test_a_sentence_said_again_while_its_first_echo_still_sounds_is_no_late_refe
     found = events(EgoFilter(profile, engine="linear"), later(profile.echo.predict(said), 19_200) + fan, said)
     assert "realigned" in {event.kind for event in found}
     assert not {event.kind for event in found} & set(SET_UP_WRONG)
+
+
+def another_agent(said):
+    """A second robot talks at once, as loud, in no reference."""
+    return said, np.roll(said[::-1], RATE)
+
+
+def music(said):
+    """The reference holds music under the voice: chords of half a second."""
+    notes = 220.0 * 2 ** (np.random.default_rng(0).integers(0, 24, (said.size // 8000, 3)) / 12)
+    phase = 2 * np.pi * np.cumsum(np.repeat(notes, 8000, axis=0) / RATE, axis=0)
+    return said + (0.3 * np.std(said) * np.sin(phase).sum(axis=1)).astype(np.float32), 0 * said
+
+
+def echo_bot(said):
+    """The robot says everything again that a human beside it has just said: 1.5 s of words, 2 s later."""
+    words = said * (np.arange(said.size) // 24_000 % 3 == 1)
+    return later(words, 32_000), words
+
+
+@pytest.mark.parametrize("scene", [another_agent, music, echo_bot])
+def test_the_lag_is_found_and_nothing_is_said_to_be_wrong_with(scene, robot):
+    said, beside = scene(np.tile(robot[1], 2)[: 15 * RATE])
+    echo = later(Profile.load(DEMO / "profile.npz").echo.predict(said), 3_000 - PRE_ROLL)
+    heard = echo + np.std(echo) / np.std(said) * beside  # as loud as the robot
+    heard += 1e-4 * np.random.default_rng(0).standard_normal(said.size).astype(np.float32)
+    ego = EgoFilter(engine="linear")
+    assert not {event.kind for event in events(ego, heard, said)} & set(SET_UP_WRONG)
+    assert ego.stats()["alignment"]["delay_samples"] == pytest.approx(3_000, abs=40)
 
 
 @pytest.mark.parametrize("late", [0, 128])
