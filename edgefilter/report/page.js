@@ -70,7 +70,7 @@ function drawStaircase(on) {
   });
   if (boxes.length) {
     put(stairPlot, "tread", { left: (columns - 1) * width - gap, width: 2 * gap, bottom: height(level) });
-    total(columns - 1, Math.max(level, data.irreducible_db), "left");
+    total(columns - 1, Math.max(level, data.irreducible_db || level), "left");
   }
   stairPlot.setAttribute("role", "img");
   stairPlot.setAttribute("aria-label", `Error budget over the noise floor. ${told.join("; ")}; irreducible: ${db(data.irreducible_db)}`);

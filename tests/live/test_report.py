@@ -110,6 +110,10 @@ def test_switches_move_the_figure_the_stairs_the_bars_the_picture_and_the_sound(
         assert browser.run(steps) == key.count("1")
         assert f"{abs(now['excess_db']):.1f} dB" in browser.run("document.querySelector('#staircase .plot').ariaLabel")
     assert len(set(sources.values())) == 4
+    last = "drawStaircase([true, true]), [...document.querySelectorAll('.amount')].at(-1).textContent"
+    for irreducible_db, left in ((0, "−0.2"), (8, "8.0")):
+        browser.run(f"data.irreducible_db = {irreducible_db}, data.variants['11'].excess_db = -0.2")
+        assert browser.run(last) == left
     assert heights["11"] < 0.3 * heights["00"]
     gain, bent = found.ranking
     for key, expected in (("00", gain.excess_before_db), ("10", gain.excess_after_db), ("11", found.remaining_db)):
