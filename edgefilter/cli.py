@@ -22,7 +22,7 @@ from edgefilter.echo.effects.catalogue import names
 from edgefilter.echo.user_effects import load_effect
 from edgefilter.engines import HAVE_MODEL
 from edgefilter.errors import EdgefilterError, UsageError, printable
-from edgefilter.options import ASK, CONFIRM, ENGINE, MIC_CHANNELS, channel, number, positive, whole
+from edgefilter.options import ASK, CONFIRM, ENGINE, FALSE_STARTS, MIC_CHANNELS, channel, number, positive, whole
 from edgefilter.types import SoundFor
 
 EFFECTS = {
@@ -119,6 +119,7 @@ def _run(commands: argparse._SubParsersAction) -> None:
     told = "the same when the human may have begun (speech_suspected) and when nobody has (speech_dismissed)"
     option("--on-suspicion", type=command, metavar="COMMAND", help=told)
     option("--confirm-s", **CONFIRM)
+    option("--false-starts-per-hour", **FALSE_STARTS)
     option("--play", metavar="FILE", help="live: play this speech of the robot, which then is the reference")
     option("--speaker", metavar="DEVICE", help="output device for --play (default: default)")
     told = "when the human begins to speak, end what --play plays, or lower it by 10 dB until the human is quiet"
@@ -290,6 +291,7 @@ def _serve(commands: argparse._SubParsersAction) -> None:
     option("--profile", metavar="P.npz", help="calibrated robot, of all clients")
     option("--engine", **ENGINE)
     option("--confirm-s", **CONFIRM)
+    option("--false-starts-per-hour", **FALSE_STARTS)
     streams = whole(1, 10_000, "a number of streams, 1 or more")
     option("--streams", type=streams, metavar="N", help="clients at a time (default: 4 a core)")
 
@@ -307,6 +309,7 @@ def _ros2(commands: argparse._SubParsersAction) -> None:
     option("--profile", metavar="P.npz", help="calibrated robot")
     option("--engine", **ENGINE)
     option("--confirm-s", **CONFIRM)
+    option("--false-starts-per-hour", **FALSE_STARTS)
     option("--ask-db", **ASK)
     told = "domain of DDS (default: ROS_DOMAIN_ID, or 0)"
     option("--domain", type=whole(0, 232, "a domain, 0 to 232"), metavar="N", help=told)

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 
 from edgefilter.audio.channels import Channels
 from edgefilter.engines import ENGINES
-from edgefilter.filter.barge_in import BargeInSettings
+from edgefilter.filter.barge_in import USUAL_S, BargeInSettings
 
 Option: TypeAlias = dict[str, Any]
 
@@ -41,6 +41,7 @@ def number(least: float, most: float, expected: str, closed: bool = False) -> Ca
 
 
 positive = number(0.0, 1e6, "a number above 0")
+_rate = number(0.0, 3600.0 / USUAL_S, f"a rate above 0 and below {3600.0 / USUAL_S:.0f} an hour")
 channel = whole(0, 63, "the number of a channel, 0 to 63")
 """Of a device or a file, counted from 0: interfaces of studios have so many."""
 
@@ -59,6 +60,13 @@ CONFIRM: Option = {
     "default": BargeInSettings.confirm_s,
     "metavar": "S",
     "help": "longest time from the suspicion that the human speaks to certainty; 0: the suspicion is enough (default: %(default)g)",
+}
+FALSE_STARTS: Option = {
+    "dest": "threshold",
+    "type": lambda text: BargeInSettings.at_rate(_rate(text)).threshold,
+    "default": BargeInSettings.threshold,
+    "metavar": "RATE",
+    "help": "false starts in an hour of the robot's speech; the fewer, the more humans are missed (default: 16)",
 }
 ASK: Option = {
     "type": number(0.0, 40.0, "0 to 40 dB", closed=True),

@@ -38,7 +38,7 @@ def _node(args: argparse.Namespace) -> None:
     if args.domain is None and not named.isdecimal():
         raise UsageError(f"ROS_DOMAIN_ID is '{named}', expected a number: set it, or give --domain")
     domain = int(named) if args.domain is None else args.domain
-    settings = BargeInSettings(judge="network", confirm_s=args.confirm_s, ask_db=args.ask_db)
+    settings = BargeInSettings(args.threshold, confirm_s=args.confirm_s, judge="network", ask_db=args.ask_db)
     ego = EgoFilter(args.profile, engine=args.engine, barge_in=settings)
     names = args.mic, args.reference, args.silenced, args.human
     array = Channels.named(args.mic_channels, args.reference_channel)

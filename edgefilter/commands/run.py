@@ -195,7 +195,7 @@ def make_filter(args: argparse.Namespace, live: bool, profile: Profile | None) -
         engine=engine,
         budget_ms=budget_ms if live else None,
         model=args.model,
-        barge_in=BargeInSettings(confirm_s=args.confirm_s, ask_db=args.ask_db),
+        barge_in=BargeInSettings(args.threshold, confirm_s=args.confirm_s, ask_db=args.ask_db),
         learn=make_learner(args, live, profile),
         output=args.sound,
     )

@@ -39,7 +39,7 @@ def main(args: argparse.Namespace) -> None:
 
     def make_filter(learns: bool, form: Form) -> EgoFilter:
         learner = BackgroundLearner(profile) if learns else None
-        settings = BargeInSettings(judge="network", confirm_s=args.confirm_s, ask_db=form.ask_db)
+        settings = BargeInSettings(args.threshold, confirm_s=args.confirm_s, judge="network", ask_db=form.ask_db)
         return EgoFilter(profile, engine=args.engine, barge_in=settings, learn=learner, output=form.output)
 
     make_filter(False, Form())  # what cannot be made is said now, and what is slow to load is loaded

@@ -30,7 +30,7 @@ from edgefilter.errors import EdgefilterError, UsageError
 from edgefilter.filter.barge_in import BargeInSettings
 from edgefilter.filter.ego_filter import EgoFilter
 from edgefilter.integrations.duplex import Duplex
-from edgefilter.options import ASK, CONFIRM, ENGINE, MIC_CHANNELS
+from edgefilter.options import ASK, CONFIRM, ENGINE, FALSE_STARTS, MIC_CHANNELS
 from edgefilter.types import SAMPLE_RATE, Event
 
 
@@ -42,6 +42,7 @@ def _options(words: list[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--channels", type=int, default=1, help="of the microphone's sound, interleaved")
     parser.add_argument("--mic-channels", **MIC_CHANNELS)
     parser.add_argument("--confirm-s", **CONFIRM)
+    parser.add_argument("--false-starts-per-hour", **FALSE_STARTS)
     parser.add_argument("--ask-db", **ASK)
     return vars(parser.parse_args(words))
 
@@ -55,7 +56,7 @@ class HumanConf(SICConfMessage):
 
     profile: file of the calibrated robot, where the component runs. engine: as of `EgoFilter`. channels: of the
     microphone's sound, interleaved, of which a message does not tell how many it has. mic_channels: as of `Duplex`.
-    confirm_s, ask_db: as of `BargeInSettings`.
+    confirm_s, ask_db, threshold: as of `BargeInSettings`.
     """
 
     profile: str | None = None
@@ -64,6 +65,7 @@ class HumanConf(SICConfMessage):
     mic_channels: Sequence[int] | None = None
     confirm_s: float | None = None
     ask_db: float | None = None
+    threshold: float | None = None
 
 
 def _ears(
@@ -72,6 +74,7 @@ def _ears(
     channels: int,
     mic_channels: Sequence[int] | Channels | None,
     confirm_s: float,
+    threshold: float,
     ask_db: float,
     on_event: Callable[[Event], None] | None = None,
 ) -> tuple[Duplex, int]:
@@ -79,7 +82,7 @@ def _ears(
     if channels < 1:
         raise UsageError(f"channels is {channels}, expected at least 1")
     array = Channels.named(mic_channels, there=channels)
-    settings = BargeInSettings(judge="network", confirm_s=confirm_s, ask_db=ask_db)
+    settings = BargeInSettings(threshold, confirm_s=confirm_s, judge="network", ask_db=ask_db)
     ego = EgoFilter(profile, engine=engine, barge_in=settings)
     return Duplex(ego, on_event=on_event, mic_channels=array), channels
 

@@ -47,7 +47,7 @@ from edgefilter.filter.turns import BEFORE_S
 from edgefilter.integrations.doors import complain_briefly, is_own
 from edgefilter.integrations.duplex import MOST_QUEUED_S, Duplex, as_pcm16, from_pcm16
 from edgefilter.integrations.turns import TurnByTurn
-from edgefilter.options import ASK, CONFIRM, ENGINE, MIC_CHANNELS, channel
+from edgefilter.options import ASK, CONFIRM, ENGINE, FALSE_STARTS, MIC_CHANNELS, channel
 from edgefilter.types import SAMPLE_RATE, Event
 
 MOST_BYTES = round(MOST_QUEUED_S * SAMPLE_RATE) * np.int16().itemsize
@@ -499,6 +499,7 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--profile", help="the calibrated robot")
     parser.add_argument("--engine", **ENGINE)
     parser.add_argument("--confirm-s", **CONFIRM)
+    parser.add_argument("--false-starts-per-hour", **FALSE_STARTS)
     parser.add_argument("--ask-db", **ASK)
     parser.add_argument("--mic-uri", default=MIC_URI, help="where satellites find the microphone")
     parser.add_argument("--snd-uri", default=SND_URI, help="where satellites find the loudspeaker")
@@ -516,7 +517,7 @@ def main(words: list[str] | None = None) -> int:
                     f"{option} {uri} lets other machines listen, and Wyoming knows no password: leave it out, or say --open"
                     " where every machine that reaches it may hear the microphone and speak"
                 )
-        settings = BargeInSettings(judge="network", confirm_s=args.confirm_s, ask_db=args.ask_db)
+        settings = BargeInSettings(args.threshold, confirm_s=args.confirm_s, judge="network", ask_db=args.ask_db)
         ego = EgoFilter(args.profile, engine=args.engine, barge_in=settings)
         mic_format = AudioFormat(args.mic_command_rate, 2, args.mic_command_channels)
         snd_format = AudioFormat(args.snd_command_rate, 2, args.snd_command_channels)

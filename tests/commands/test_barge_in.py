@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import soundfile
 
-from edgefilter import EgoFilter
+from edgefilter import BargeInSettings, EgoFilter, UsageError
 from edgefilter.cli import main
 from edgefilter.commands import observers
 from edgefilter.commands.observers import Availability, EventCommand, Lowering
 from edgefilter.filter.barge_in import INTERRUPTIONS, SUSPICIONS
 from edgefilter.session import Progress
 from edgefilter.types import Event
-from tests.program import argv
+from tests.program import DEMO, argv
 
 GAIN = Event("voice_gain", 24000, "0.250")
 STARTED, STOPPED = (Event(f"speech_{word}", 24000, "probability 0.98") for word in ("started", "stopped"))
@@ -87,6 +87,30 @@ def test_the_robot_is_lowered_while_the_filter_asks_for_it_and_stopped_for_good_
     assert speech.gains == pytest.approx(gains)
 
 
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (
+            "run",
+            ["--input", DEMO / "mic.flac", "--reference", DEMO / "reference.flac", "--output", "-", "--engine", "crnn"],
+        ),
+        ("serve", []),
+        ("ros2", []),
+    ],
+)
+@pytest.mark.parametrize("given", [[], ["--false-starts-per-hour", "9"]], ids=["default", "9"])
+def test_a_rate_of_false_starts_is_the_threshold_of_the_filter(command, words, given, monkeypatch):
+    made = []
+
+    def make(*args, barge_in, **others):
+        made.append(barge_in)
+        raise UsageError("that is all")
+
+    monkeypatch.setattr(f"edgefilter.commands.{command}.EgoFilter", make)
+    assert main([command, *map(str, words), *given]) == 2
+    assert [one.threshold for one in made] == [(BargeInSettings.at_rate(9.0) if given else BargeInSettings()).threshold]
+
+
 def test_an_engine_that_tells_no_speech_is_said_once_and_one_that_does_is_not():
     for engine, expected in (("bypass", 1), ("crnn", 0)):
         said = []
@@ -105,6 +129,7 @@ def test_an_engine_that_tells_no_speech_is_said_once_and_one_that_does_is_not():
     ("words", "expected"),
     [
         (["--input", "mic", "--on-barge-in", " "], "' ' is not a command"),
+        (["--input", "mic", "--false-starts-per-hour", "90"], "'90' is not a rate above 0 and below 90 an hour"),
         (["--input", "mic", "--barge-in", "stop"], "--barge-in concerns the speech that --play plays"),
         (["--input", "mic", "--barge-in", "shout", "--play", "x.wav"], "'shout'"),
         (["--input", "mic", "--speaker", "x"], "--speaker concerns"),

@@ -23,7 +23,7 @@ NEITHER = {
     "mic_channels", "reference_channel", "reference_channels", "channel",
     "help", "version", "debug", "command", "word", "engine", "budget_ms", "remeasure", "seconds", "quiet", "live",
     "speaker", "level_db", "effect", "force", "prove", "verbose", "no_learn", "on_barge_in", "on_suspicion", "confirm_s", "ask_db", "barge_in",
-    "sound",
+    "sound", "threshold",
     "setup", "load", "unload",
     "hidden", "multisine",
     "no_chirp", "false_rate",
