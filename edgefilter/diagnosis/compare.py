@@ -41,7 +41,8 @@ class Comparison:
     residual's correlation with the reference, by lag. silence_excess_db: while the robot is silent; nan where it never
     is. human: (start_s, end_s) where somebody talks, left out. offset_samples: lag of the recording against the
     calibration, constant. recording, prediction, residual: (n,), aligned. independence: whether the residual is white
-    and independent of the reference; None for less than a second of the robot.
+    and independent of the reference; None for less than a second of the robot. drift_ppm: how much faster the microphone's
+    clock runs than the reference's, where that is taken out.
     """
 
     excess_db: float
@@ -58,6 +59,7 @@ class Comparison:
     prediction: Samples = field(repr=False)
     residual: Samples = field(repr=False)
     independence: Independence | None = field(default=None, repr=False)
+    drift_ppm: float = 0.0
 
     def to_dict(self) -> dict[str, object]:
         """All but the signals, ready for JSON."""

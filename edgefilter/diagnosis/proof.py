@@ -101,12 +101,12 @@ class HeldOut:
         else talks is left out.
         """
         before, after = self._left_before, self._left_with(names)
-        erle_db = self._erle_db(before), self._erle_db(after)
+        erle_db = self.erle_db(before), self.erle_db(after)
         proof = Proof(tuple(names), self.cut / SAMPLE_RATE, self.seconds, *erle_db, before, after)
         if not proof.worse or len(names) < 2:
             return proof
         others = ((name, self._left_with([n for n in names if n != name])) for name in names)
-        return replace(proof, without=tuple((name, self._erle_db(left)) for name, left in others))
+        return replace(proof, without=tuple((name, self.erle_db(left)) for name, left in others))
 
     def until_kept(self, names: Sequence[str]) -> tuple[Proof, ...]:
         """The proof of all names, then without the one that does most harm, while there is one: the last names what is kept."""
@@ -117,17 +117,17 @@ class HeldOut:
 
     @cached_property
     def _left_before(self) -> Samples:
-        return self._left(self._profile)
+        return self.left(self._profile)
 
     def _left_with(self, names: Sequence[str]) -> Samples:
-        return self._left(with_fitted(self._first, self._early, names)[0])
+        return self.left(with_fitted(self._first, self._early, names)[0])
 
-    def _left(self, profile: Profile | None) -> Samples:
+    def left(self, profile: Profile | None) -> Samples:
         """What the running filter with that profile gives of the held-out seconds, (n,)."""
         said = np.pad(self._prepared.measurement.reference, (0, AHEAD))[self.cut + AHEAD :]
         return enhance(self._prepared.measurement.recording[self.cut :], said, profile, engine="linear")
 
-    def _erle_db(self, left: Samples) -> float:
+    def erle_db(self, left: Samples) -> float:
         """ERLE over the seconds of the robot alone, dB."""
         heard = self._prepared.measurement.recording[self.cut :]
         before, after = (decibels(np.sum(np.square(x[self._tested], dtype=np.float64))) for x in (heard, left))

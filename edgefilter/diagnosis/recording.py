@@ -19,8 +19,11 @@ from edgefilter.diagnosis.proof import HeldOut, Proof, lasts, listed, with_fitte
 from edgefilter.diagnosis.result import Candidate, Diagnosis
 from edgefilter.diagnosis.select import search
 from edgefilter.diagnosis.straightened import Straightened
+from edgefilter.diagnosis.trials import Workbench
 from edgefilter.dsp.resample import at_16_khz
+from edgefilter.echo.effect import first
 from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.effects.catalogue import names as known_effects
 from edgefilter.errors import SignalError
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Samples
@@ -97,7 +100,22 @@ class Recording:
         return HeldOut(self._given, self.straightened, self.mic, self.reference)
 
     def compare(self) -> Comparison:
-        """Say how far the profile's prediction is from the recording, and where: `compare`."""
+        """Say how far the profile's prediction is from the recording, and where, once the clocks' drift is taken out: `compare`."""
+        bench, start = Workbench(self.straightened, Criteria()), self.straightened.model
+        timed = (
+            bench.attempt(name, start)
+            for name in known_effects()
+            if find(name).followed and find(name).family == "time"
+        )
+        best = bench.preferred(trial for trial in timed if trial and bench.worth(trial, start))
+        if best is None or find(best.name).event:
+            return self.as_it_is()
+        ppm, offset = (first(best.values, name) for name in ("ppm", "offset"))
+        found = describe(self.straightened, best.model, best.score)
+        return replace(found, drift_ppm=-ppm, offset_samples=found.offset_samples + offset)
+
+    def as_it_is(self) -> Comparison:
+        """Compare with the clocks' drift left in, as a diagnosis begins."""
         return describe(self.straightened, self.straightened.model)
 
     def at_first_sight(self, criteria: Criteria | None = None) -> dict[str, float]:
@@ -172,14 +190,14 @@ class Recording:
         """Fit effects, beside each other, and write them into a new profile: `add`."""
         prepared = self.straightened
         knowing, model, straightened = with_fitted(self.profile, prepared, listed(names))
-        before, after = self.compare(), Recording(self.mic, self.reference, knowing).compare()
+        before, after = self.as_it_is(), Recording(self.mic, self.reference, knowing).as_it_is()
         if not straightened:
             return Added(knowing, before, after)
         values = dict(model.effects)
         straight = prepared.model.with_effects(straightened, values)
         told = tuple(f"{name} is taken out first: {find(name).sentence(values[name])}" for name in straightened)
         left = f"{before.excess_db:.1f} dB over the noise floor before, {after.excess_db:.1f} dB after"
-        told += (f"with that left in, as compare has it: {left}",)
+        told += (f"with that left in: {left}",)
         told_of = replace(prepared, warnings=(*told, *prepared.warnings))
         return Added(knowing, describe(told_of, straight), describe(told_of, model))
 
@@ -207,7 +225,7 @@ class Recording:
         choices: list[tuple[Comparison, Profile]] = []
         for model in (fit_jointly(everywhere, start, names), start):
             knowing = self.profile.with_echo(self.profile.echo.with_effects(names, dict(model.effects)))
-            choices.append((Recording(self.mic, self.reference, knowing).compare(), knowing))
+            choices.append((Recording(self.mic, self.reference, knowing).as_it_is(), knowing))
             if choices[-1][0].excess_db <= found.remaining_db + PROMISE_DB:
                 break
         after, knowing = min(choices, key=lambda choice: choice[0].excess_db)
@@ -256,7 +274,8 @@ def compare(profile: Profile, recording: Samples, reference: Samples, *, sample_
     Notes
     -----
     Excess is the power of recording minus prediction, whitened by the fan's power spectral density, over the fan's
-    own: 0 dB where nothing is left to explain. The ordinary tolerances of path and fan are taken out.
+    own: 0 dB where nothing is left to explain. The ordinary tolerances of path and fan are taken out, and a constant lag
+    and a drift of the clocks.
 
     Examples
     --------

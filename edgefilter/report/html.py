@@ -265,6 +265,10 @@ def _facts(before: Comparison, after: Comparison | None, irreducible_db: float |
     facts = [
         ("Unexplained", f"{text.decibels(before.excess_db)} dB", "over the noise floor, with the profile as it is")
     ]
+    if before.drift_ppm:
+        facts.append(
+            ("Clocks", text.apart(before.drift_ppm), "runs the microphone's than the reference's; compensated")
+        )
     if irreducible_db:
         facts.append(("Left", f"{text.decibels(irreducible_db)} dB", f"over the fan: {text.IRREDUCIBLE}"))
     elif after is not None:

@@ -133,10 +133,17 @@ def _compared(found: Comparison) -> list[str]:
         f"excess      {decibels(found.excess_db)} dB: unpredicted power over the noise floor of {decibels(found.noise_floor_db)} dBFS",
         f"lag         {found.offset_samples:+.2f} samples relative to the calibration, compensated",
     ]
+    if found.drift_ppm:
+        lines.append(f"clocks      the microphone's runs {apart(found.drift_ppm)}, compensated")
     if math.isfinite(found.silence_excess_db):
         silence = decibels(found.silence_excess_db)
         lines.append(f"silence     {silence} dB over the noise floor while the robot is silent")
     return lines + [f"WARNING     {text}" for text in found.warnings]
+
+
+def apart(drift_ppm: float) -> str:
+    """Format how fast a clock runs, such as "43.0 ppm slower"."""
+    return f"{abs(drift_ppm):.1f} ppm {'faster' if drift_ppm > 0 else 'slower'}"
 
 
 def first_sight_line(seen: Mapping[str, float]) -> str:

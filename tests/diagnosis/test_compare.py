@@ -10,9 +10,11 @@ import soxr
 
 from edgefilter.calibration.from_recording import TAIL_S
 from edgefilter.diagnosis.prepare import find_talk, prepare
-from edgefilter.diagnosis.recording import compare
+from edgefilter.diagnosis.recording import Recording, compare
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import SignalError
+from edgefilter.report.html import comparison_page
+from edgefilter.report.text import comparison_summary
 from edgefilter.types import PRE_ROLL
 from tests.diagnosis.robot_scene import DELAY, FAN, path, profile, record, voice
 
@@ -66,6 +68,24 @@ def test_utterances_with_lags_of_their_own_are_aligned_one_by_one() -> None:
     )
     assert found.excess_db < 0.5
     assert any("different numbers of samples" in text and "4321.5 from" in text for text in found.warnings)
+
+
+def test_clocks_that_drift_are_taken_out_and_said_but_not_for_a_diagnosis() -> None:
+    """A jump, which a line through the lags imitates, is no drift."""
+    x = voice(8.0)
+    names = {"profile": "p", "recording": "m", "reference": "r"}
+    for ppm, said in ((43.0, "43.0 ppm slower"), (-80.0, "80.0 ppm faster")):
+        recording = Recording(record(x, profile().echo.with_effect("clock_drift", {"ppm": ppm})), x, profile())
+        found, left = recording.compare(), recording.as_it_is()
+        assert found.drift_ppm == pytest.approx(-ppm, abs=0.5)  # what the fit leaves of it
+        assert found.excess_db < 2.0 < 20.0 < left.excess_db and left.drift_ppm == 0.0
+        assert found.offset_samples == pytest.approx(0.0, abs=0.1)
+        assert f"clocks      the microphone's runs {said}, compensated" in comparison_summary(found)
+        assert f"<dt>Clocks</dt><dd><b>{said}</b>" in comparison_page(found, names)
+    late = {"times_s": np.array([4.0]), "samples": np.array([20.0])}
+    jumped = Recording(record(x, profile().echo.with_effect("delay_jump", late)), x, profile()).compare()
+    assert jumped.drift_ppm == 0.0 and jumped.excess_db > 20.0
+    assert not any(line.startswith("clocks") for line in comparison_summary(jumped))
 
 
 def test_somebody_talking_in_the_pauses_is_left_out_and_said() -> None:
