@@ -14,7 +14,7 @@ seed, said (the robot's sentences, each with its first and last sample in ref). 
 lag + delay - ppm 1e-6 t. Kinds: `paper`, one lag of 50-300 ms; `live`, lag before t_main and lag2 after (0-1.2 s each),
 volume turned by up to 3 dB between them (volume_db), clocks 10-300 ppm apart (either sign). Even conversations take
 place in the laboratory (RT60 0.20-0.26 s), odd ones in an office (0.50-0.75 s). Item i of a seed is the same whatever
---count is.
+--count is, and with --microphone but for what that changes.
 
 How it compares with a set of ten `paper` conversations simulated by other hands (lab / office means: theirs; then 60 of
 these with --distortion strong):
@@ -42,6 +42,7 @@ from scipy import signal
 from tqdm import tqdm
 
 from bench.simulate import simulated_robot as physics
+from bench.simulate.microphones import MICROPHONES
 from bench.simulate.simulated_robot import RATE, Array, Rng, Robot
 from edgefilter.dsp.metrics import si_sdr
 
@@ -149,9 +150,15 @@ def draw_lags(rng: Rng, kind: str, pause: int) -> tuple[int, int, float, float]:
 
 
 def make_scene(
-    seed: int, index: int, kind: str, speech: list[Clip], voices: Voices, distortion: str = "moderate"
+    seed: int,
+    index: int,
+    kind: str,
+    speech: list[Clip],
+    voices: Voices,
+    distortion: str = "moderate",
+    microphone: str | None = None,
 ) -> Scene:
-    """Item index of this seed: signals (n,) float64 and the contents of meta.json."""
+    """Item index of this seed: signals (n,) float64 and the contents of meta.json; the same but for what the microphone changes."""
     rng = np.random.default_rng([seed, index])
     human_clip = speech[np.random.default_rng(seed).permutation(len(speech))[index % len(speech)]]
     voice = str(rng.choice(sorted(voices)))
@@ -171,6 +178,9 @@ def make_scene(
     end = min(start + human.size + RATE // 10, ref.size)
     paths, span = (laboratory.robot, room.robot), slice(start, end)
     signals, scores, gain = record_all(rng, room_name, robot, paths, voice_heard, clean, span, noises)
+    if microphone:
+        signals = MICROPHONES[microphone](np.random.default_rng([seed, index, 1]), signals, voice_heard)
+        scores["sisdr_mix"] = si_sdr(signals["mic"][span], signals["clean"][span])
     impulse = np.eye(1, 4096)[0]
     delay = int(np.argmax(np.abs(robot.record(impulse, laboratory.robot, linear=True))))
     meta = {"room": room_name, "rt60": room.rt60_s, "voice": voice, "speaker": human_clip.speaker}
@@ -262,13 +272,16 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True, metavar="DIR")
     parser.add_argument("--kind", choices=("paper", "live"), required=True)
     parser.add_argument("--distortion", choices=tuple(DISTORTION_DB), default="moderate", help="of the loudspeaker")
+    parser.add_argument(
+        "--microphone", choices=tuple(MICROPHONES), help="what else it does or hears, see microphones.py"
+    )
     parser.add_argument("--count", type=int, default=24)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     speech = read_clips(options.speech, (3.0, 12.0))
     voices = read_voices(options.voices)
     for index in tqdm(range(options.count), unit="conversation", desc=str(options.output)):
-        scene = make_scene(options.seed, index, options.kind, speech, voices, options.distortion)
+        scene = make_scene(options.seed, index, options.kind, speech, voices, options.distortion, options.microphone)
         write_item(options.output / f"{scene.meta['room']}_{index:02d}", scene.signals, "meta", scene.meta)
 
 

@@ -11,10 +11,10 @@ import pytest
 import soundfile as sf
 
 from bench import recordings
-from bench.simulate import conversations
+from bench.simulate import conversations, microphones
 from bench.simulate import simulated_robot as robot
 from edgefilter.dsp.metrics import si_sdr
-from tests.bench.conftest import RATE, babble, make
+from tests.bench.conftest import RATE, babble, driven, make
 
 
 def read(folder: Path, name: str) -> np.ndarray:
@@ -125,3 +125,67 @@ def test_loudspeaker_is_linear_when_barely_driven_and_distorts_when_driven() -> 
     )  # asymmetry grows with the drive, 20 dB a decade at least
     doubled = driver.play(2 * x, linear=True)
     np.testing.assert_allclose(doubled, 2 * driver.play(x, linear=True), atol=1e-9)  # float64 rounding
+
+
+def scene_signals(seconds: int = 4) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """A voice that pauses every second half second, a human behind it, a fan; and the voice."""
+    rng = np.random.default_rng(1)
+    loud = np.repeat(rng.uniform(0.03, 0.3, 10 * seconds), RATE // 10) * (np.arange(seconds * RATE) % RATE < RATE // 2)
+    voice = loud * rng.standard_normal(seconds * RATE)
+    clean, fan = 0.01 * rng.standard_normal(voice.size), 0.001 * rng.standard_normal(voice.size)
+    clean[: voice.size // 2] = 0
+    signals = {"sweep_ref": voice, "sweep_mic": voice + fan, "fan_only": fan, "mic": voice + clean + fan}
+    return signals | {"clean": clean, "fan": fan}, voice
+
+
+def test_a_processed_microphone_lowers_the_fan_and_changes_the_human_with_all_and_no_linear_filter_follows_it() -> None:
+    signals, voice = scene_signals()
+    found = microphones.processed(np.random.default_rng(3), signals, voice)
+    pause = np.arange(voice.size) % RATE >= 3 * RATE // 4
+    before = pause & (np.arange(voice.size) < voice.size // 2) & (np.arange(voice.size) > RATE)
+    lowered = np.mean(found["mic"][before] ** 2) / np.mean(signals["mic"][before] ** 2)
+    assert 10 * np.log10(lowered) < -3  # 8 to 15 dB of suppression, 3 of which the gain gives back
+    parts = microphones._processed(10.0, 0.5, -20.0, signals["mic"], voice, signals["clean"], signals["fan"])
+    np.testing.assert_allclose(parts[0], sum(parts[1:]), atol=1e-9)
+    spectra, after = (np.fft.rfft(x.reshape(-1, 800)) for x in (signals["mic"], found["mic"]))
+    left = after - spectra * np.sum(after * spectra.conj(), 0) / np.sum(np.abs(spectra) ** 2, 0)
+    assert np.sum(np.abs(left) ** 2) > 0.01 * np.sum(np.abs(after) ** 2)  # -20 dB, as loud as the human
+    assert np.array_equal(found["sweep_ref"], voice) and not found["clean"][:RATE].any()
+
+
+def test_a_microphone_that_hums_does_so_in_the_calibration_and_the_human_does_not() -> None:
+    signals, voice = scene_signals()
+    found = microphones.hum(np.random.default_rng(2), signals, voice)
+    for name in microphones.RECORDED:
+        added = found[name] - signals[name]
+        assert -55.1 < 20 * np.log10(abs(added.mean())) < -34.9 and -55.1 < 20 * np.log10(added.std()) < -34.9
+        peak = np.abs(np.fft.rfft(added - added.mean())).argmax() * RATE / added.size
+        assert min(abs(peak - 50), abs(peak - 60)) < 1
+    assert all(np.array_equal(found[name], signals[name]) for name in ("clean", "sweep_ref", "fan"))
+
+
+def test_motors_move_while_the_robot_speaks_and_are_in_no_calibration() -> None:
+    signals, voice = scene_signals(8)
+    found = microphones.motors(
+        np.random.default_rng(2), signals, np.where(np.arange(voice.size) < 4 * RATE, voice, 0.0)
+    )
+    moved = found["mic"] - signals["mic"]
+    assert not moved[5 * RATE :].any() and moved[: 4 * RATE].any()  # 0.8 s: the longest gesture
+    over_db = 10 * np.log10(np.mean(moved[np.abs(moved) > 0] ** 2) / np.mean(voice[voice != 0] ** 2))
+    assert -29 < over_db < -13
+    assert np.allclose(moved, found["fan"] - signals["fan"])
+    assert all(np.array_equal(found[name], signals[name]) for name in ("clean", "sweep_mic", "fan_only"))
+
+
+@pytest.mark.slow
+def test_another_microphone_records_the_same_conversation_and_its_figures_are_its_own(clips: Path) -> None:
+    speech, voices = conversations.read_clips(clips, (3.0, 12.0)), conversations.read_voices([clips])
+    with driven():
+        plain, other = (
+            conversations.make_scene(3, 0, "paper", speech, voices, microphone=microphone)
+            for microphone in (None, "motors")
+        )
+    span = slice(plain.meta["start"], plain.meta["end"])
+    assert {key for key in plain.meta if plain.meta[key] != other.meta[key]} == {"sisdr_mix"}
+    assert np.array_equal(plain.signals["ref"], other.signals["ref"])
+    assert other.meta["sisdr_mix"] == si_sdr(other.signals["mic"][span], other.signals["clean"][span])
