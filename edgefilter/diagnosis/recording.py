@@ -114,14 +114,14 @@ class Recording:
         )
         best = bench.preferred(trial for trial in lags if trial and bench.worth(trial, start))
         if best is None or find(best.name).event:
-            return self.as_it_is()
+            return self._as_it_is()
         ppm, offset = (first(best.values, name) for name in ("ppm", "offset"))
         if 1e-6 * abs(ppm) * prepared.usable.size < CLOCKS:
-            return self.as_it_is()
+            return self._as_it_is()
         found = describe(prepared, best.model, best.score)
         return replace(found, drift_ppm=-ppm, offset_samples=found.offset_samples + offset)
 
-    def as_it_is(self) -> Comparison:
+    def _as_it_is(self) -> Comparison:
         """Compare with the clocks' drift left in, as a diagnosis begins."""
         return describe(self.straightened, self.straightened.model)
 
@@ -197,7 +197,7 @@ class Recording:
         """Fit effects, beside each other, and write them into a new profile: `add`."""
         prepared = self.straightened
         knowing, model, straightened = with_fitted(self.profile, prepared, listed(names))
-        before, after = self.as_it_is(), Recording(self.mic, self.reference, knowing).as_it_is()
+        before, after = self._as_it_is(), Recording(self.mic, self.reference, knowing)._as_it_is()
         if not straightened:
             return Added(knowing, before, after)
         values = dict(model.effects)
@@ -232,7 +232,7 @@ class Recording:
         choices: list[tuple[Comparison, Profile]] = []
         for model in (fit_jointly(everywhere, start, names), start):
             knowing = self.profile.with_echo(self.profile.echo.with_effects(names, dict(model.effects)))
-            choices.append((Recording(self.mic, self.reference, knowing).as_it_is(), knowing))
+            choices.append((Recording(self.mic, self.reference, knowing)._as_it_is(), knowing))
             if choices[-1][0].excess_db <= found.remaining_db + PROMISE_DB:
                 break
         after, knowing = min(choices, key=lambda choice: choice[0].excess_db)
