@@ -60,6 +60,7 @@ class ReferenceWatch:
         self._seen_speeds: list[tuple[float, float]] = []
         self._speeds: Iterator[tuple[float, float] | None] = iter(())  # of the look that is under way
         self._to_compare, self._looks_left = LENGTH, SPEED_LOOKS
+        self._steady = 0  # samples of the robot's speech that were heard at one lag
         self._idle = True
         self._sustained, self._loudest, self._least = Sustained(), 0.0, float("inf")
         self._rise = 10 ** (hop / (10 * SAMPLE_RATE))
@@ -139,11 +140,15 @@ class ReferenceWatch:
 
     def _compare_speed(self, aligned: Aligned) -> str | None:
         """While the echo is not found, look for it at other speeds, one of them a hop; add up what looks have found."""
+        heard, ref, onsets = aligned.past
         if aligned.state == "locked":
             self._off_speed, self._seen_speeds, self._speeds = False, [(0.0, CLEAR)], iter(())
+            self._steady = 0 if aligned.realigned else self._steady + self._hop * onsets.active
+            if self._steady < LENGTH:  # at another speed one lag after the other is found for a moment
+                return None
             self._looks_left = SPEED_LOOKS
             return ""
-        heard, ref, onsets = aligned.past
+        self._steady = 0
         self._to_compare = LENGTH if self._idle else self._to_compare - self._hop * onsets.active
         found = next(self._speeds, False)
         if not isinstance(found, tuple):  # a look is under way, or none is

@@ -416,17 +416,18 @@ def test_a_fault_that_has_certainly_ended_is_told_again_when_it_begins_again(kin
     assert [[found for found, _ in told].count(kind) for told in said] == [number in at for number in range(len(looks))]
 
 
-def test_another_speed_is_told_again_after_the_robot_was_found_in_between(monkeypatch):
+@pytest.mark.parametrize(("found", "told"), [(26, 4), (24, 1)], ids=["for 2.6 s", "for 2.4 s"])
+def test_another_speed_is_told_again_after_the_robot_was_followed_at_one_lag_in_between(found, told, monkeypatch):
     monkeypatch.setattr("edgefilter.filter.reference_watch.speeds", lambda mic, ref: iter((None, (1.05, 2.0))))
     watch, hop, onsets, said = ReferenceWatch(1600, 1601), np.ones(1600, np.float32), OnsetDetector(1600), []
     past = Past(DelayBuffer(BEHIND + LENGTH + AHEAD), DelayBuffer(BEHIND + LENGTH + AHEAD), onsets)
-    for state in 4 * (["begun"] * 80 + ["locked"]):
+    for state in 4 * (["begun"] * 80 + ["locked"] * found):
         for buffer in past[:2]:
             buffer.push(hop)
         onsets.step(hop)
         aligned = Aligned(hop, 0.0, 0.0, 0.0, state, False, past=past)
         said += watch.step(hop, -hop[::-1], aligned, SILENT_FRAME, Removal(1600), False)
-    assert [kind for kind, _ in said].count("rate_mismatch") == 4
+    assert [kind for kind, _ in said].count("rate_mismatch") == told
 
 
 def test_where_hardly_anything_sounds_a_speed_is_not_clear_beyond_all_bounds():
