@@ -26,8 +26,6 @@ TOLD = 0.1
 T = 1.7
 """90 % quantile of Student's t with as many degrees of freedom as some ten to thirty seconds have blocks to fit to; over the square root
 of 3, that with 2: of three fits to a third each."""
-
-
 Spread: TypeAlias = tuple[float | None, Source, float, float]
 """How well a number is known: its standard error, the method that gave it, and how far below and above it the 90 % interval ends."""
 
@@ -59,20 +57,37 @@ def precision(
     told = [(step, parameter) for step in found.steps for parameter in find(step.name).told]
     sizes = [np.size(step.values[parameter.name]) for step, parameter in told]
     numbers = [Number(*one, i) for one, size in zip(told, sizes, strict=True) if size <= MOST for i in range(size)]
-    ends = [(number.parameter.low, number.parameter.high) for number in numbers]
-    spreads: dict[int, Spread] = {
-        i: (None, "at its bound", 0.0, 0.0) for i, n in enumerate(numbers) if n.value in ends[i]
-    }
-    few = {step.name: max(map(np.size, step.values.values()), default=0) <= MOST for step in found.steps}
-    free = (i for i, number in enumerate(numbers) if i not in spreads and few[number.step.name])
+    ended = (i for i, n in enumerate(numbers) if n.value in (n.parameter.low, n.parameter.high))
+    spreads: dict[int, Spread] = {i: (None, "at its bound", 0.0, 0.0) for i in ended}
+    shared, doubts = _by_derivatives(found, numbers, spreads), _by_thirds(found, numbers, spreads, progress)
+    known = [
+        Known(n.step.name, n.parameter.name, n.place, n.value, n.parameter.unit, *spreads[i][:2])
+        for i, n in enumerate(numbers)
+    ]
+    correlations = tuple((known[i].label, known[j].label, r) for i, j, r in shared)
+    return Precision(tuple(known), correlations), _intervals(numbers, spreads), doubts
+
+
+def _by_derivatives(found: Found, numbers: list[Number], spreads: dict[int, Spread]) -> list[tuple[int, int, float]]:
+    """Add the spreads of the numbers that the prediction's derivatives tell; the correlations that are told, the closest first."""
+    few = {step.name for step in found.steps if max(map(np.size, step.values.values()), default=0) <= MOST}
+    free = (i for i, number in enumerate(numbers) if i not in spreads and number.step.name in few)
     moved = {i: x for i in free if (x := _derivative(found, numbers[i])) is not None}
-    shared = []
-    if solved := _solved(found, np.stack(list(moved.values()))) if moved else None:
-        errors = np.sqrt(np.diag(solved[0])).tolist()
-        for i, error, step in zip(moved, errors, solved[1].tolist(), strict=True):
-            spreads[i] = error, "jacobian", T * error - min(step, 0.0), T * error + max(step, 0.0)
-        pairs = combinations(enumerate(moved), 2)
-        shared = [(i, j, float(solved[0][a, b] / (errors[a] * errors[b]))) for (a, i), (b, j) in pairs]
+    solved = _solved(found, np.stack(list(moved.values()))) if moved else None
+    if solved is None:
+        return []
+    errors = np.sqrt(np.diag(solved[0]))
+    for i, error, step in zip(moved, errors.tolist(), solved[1].tolist(), strict=True):
+        spreads[i] = error, "jacobian", T * error - min(step, 0.0), T * error + max(step, 0.0)
+    alike = solved[0] / errors / errors[:, None]
+    pairs = ((i, j, float(alike[a, b])) for (a, i), (b, j) in combinations(enumerate(moved), 2))
+    return sorted((pair for pair in pairs if abs(pair[2]) >= TOLD), key=lambda pair: -abs(pair[2]))
+
+
+def _by_thirds(
+    found: Found, numbers: list[Number], spreads: dict[int, Spread], progress: Callable[[str], None] | None
+) -> list[str]:
+    """Add the spreads that are left, from fits to thirds; why one of these failed."""
     doubts: list[str] = []
     for one in found.steps:
         if left := [i for i, number in enumerate(numbers) if number.step is one and i not in spreads]:
@@ -80,11 +95,11 @@ def precision(
                 progress(f"how well {one.name} is known")
             fits = _thirds(found, one, doubts)
             spreads |= {i: _scatter(numbers[i], fits) for i in left}
-    known = [
-        Known(n.step.name, n.parameter.name, n.place, n.value, n.parameter.unit, *spreads[i][:2])
-        for i, n in enumerate(numbers)
-    ]
-    close = sorted((one for one in shared if abs(one[2]) >= TOLD), key=lambda one: -abs(one[2]))
+    return doubts
+
+
+def _intervals(numbers: list[Number], spreads: dict[int, Spread]) -> dict[str, dict[str, Interval]]:
+    """Of each effect and parameter, within its bounds."""
     intervals: dict[str, dict[str, Interval]] = {}
     for i, (trial, parameter, place) in enumerate(numbers):
         if place == 0:
@@ -92,8 +107,7 @@ def precision(
             below, above = np.array([spreads[i + k][2:] for k in range(value.size)]).T.reshape(2, *value.shape)
             low, high = np.clip((value - below, value + above), parameter.low, parameter.high)
             intervals.setdefault(trial.name, {})[parameter.name] = Interval.of(value, low, high, parameter.unit)
-    correlations = tuple((known[i].label, known[j].label, r) for i, j, r in close)
-    return Precision(tuple(known), correlations), intervals, doubts
+    return intervals
 
 
 def _derivative(found: Found, number: Number) -> Array | None:
