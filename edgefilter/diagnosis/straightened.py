@@ -15,7 +15,7 @@ from scipy.ndimage import uniform_filter1d
 from edgefilter.dsp import fourier
 from edgefilter.dsp.convolution import filtered
 from edgefilter.dsp.fractional_delay import interpolate
-from edgefilter.dsp.frames import decibels, frames
+from edgefilter.dsp.frames import block_sums, decibels, frames
 from edgefilter.dsp.psd import GRID_BINS, ROUNDING_PSD, coloured, floored, frequencies, hann, variance_at
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.echo.effect import STAGES
@@ -304,8 +304,8 @@ def _window() -> Samples:
 
 def _within(x: NDArray[np.generic], starts: NDArray[np.integer]) -> Array:
     """The sum of x (n,) over the cell from each start on, (starts,)."""
-    total = np.concatenate(([0.0], np.cumsum(x, dtype=np.float64)))
-    return np.asarray(total[starts + SPAN] - total[starts])
+    total = np.cumsum(np.append(0.0, block_sums(x, HOP)))  # cells begin and end with a hop
+    return np.asarray(total[(starts + SPAN) // HOP] - total[starts // HOP])
 
 
 def _mean(cells: Array) -> float:

@@ -75,7 +75,7 @@ def fit_filter(
 def fit_supported(x: Samples, target: Samples, weights: Samples, lead: int, prior: Array) -> Array:
     """fit_filter's answer; zeros where a filter from half of the samples does not help on the other half (BLOCKs, two by two)."""
     half, taps = np.arange(x.size) // BLOCK % 4 < 2, prior.size
-    trial = filtered(x, fit_filter(x, target, weights * half, taps, lead, prior, steps=20), lead)
+    trial = filtered(x, fit_filter(x, target, weights * half, taps, lead, prior, steps=8), lead)
     fall = float(np.dot(target * target - (target - trial) ** 2, weights * ~half))
     return fit_filter(x, target, weights, taps, lead, prior, steps=20) if fall > 0.0 else np.zeros(taps)
 
@@ -141,7 +141,7 @@ class Spectra:
 
 def spectra(measurement: Measurement, model: VoiceModel, resolution_hz: float = 20.0) -> Spectra:
     """Auto- and cross-spectra of a model's whitened prediction and the recording over the fit samples, averaged over bands of resolution_hz."""
-    n = _transformed(measurement.recording.size)
+    n = fft.next_fast_len(measurement.recording.size, real=True)
     whole = measurement.once(_spectra, model)
     width = max(int(resolution_hz * n / SAMPLE_RATE), 1)
     count = whole[0].size // width
@@ -150,13 +150,9 @@ def spectra(measurement: Measurement, model: VoiceModel, resolution_hz: float = 
     return Spectra(hz, auto, cross, own, 2.0 * width / n * float(np.sum(measurement.weights)), width)
 
 
-def _transformed(size: int) -> int:
-    return fft.next_fast_len(size, real=True)
-
-
 def _spectra(measurement: Measurement, model: VoiceModel) -> tuple[Array, NDArray[np.complex128], Array]:
     """In each bin, of the whitened fit samples: power of the prediction, cross-spectrum, power of the recording."""
     signals = measurement.predicted(model)[1], measurement.white_recording
-    n = _transformed(signals[0].size)
+    n = fft.next_fast_len(signals[0].size, real=True)
     a, b = (fft.rfft((x * measurement.weights).astype(np.float64), n) for x in signals)
     return power_of(a), b * a.conj(), power_of(b)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import product
+from itertools import chain, product
 
 import numpy as np
 import scipy
@@ -99,13 +99,12 @@ class Codec(Effect):
         if measurement.noise_psd is None:
             return neutral(self)
         predicted, target = measurement.predicted(model)[1], measurement.white_recording
-        if not _is_codec(measurement, predicted):
-            return neutral(self)
         over, voice = band_power(target - predicted), band_power(predicted)
         use = frames_to_fit(measurement.fit, len(over))
         loud = use & (voice.mean(axis=1) > HEARD)
         clear = voice[loud].mean(axis=0) > CLEAR if loud.any() else np.zeros(BANDS, bool)
-        if not clear.any() or np.median(over[loud].mean(axis=0)[clear]) < STANDS_OUT:
+        stands_out = clear.any() and np.median(over[loud].mean(axis=0)[clear]) >= STANDS_OUT
+        if not (stands_out and _is_codec(measurement, predicted)):
             return neutral(self)
         levels = {decay: _levels(measurement.reference, decay) for decay in DECAYS_MS}
         tried = [
@@ -143,7 +142,7 @@ def _is_codec(measurement: Measurement, voice: Samples) -> bool:
     voice, left = voice + fine, left - fine
     heard = (measurement.weights > 0.0) & (uniform_filter1d(voice * voice, LONG[0]) > HEARD)
     cells = _spectra(voice, *SHORT), _spectra(left, *SHORT), _whole(heard, *SHORT)
-    return _follows(*cells) > FOLLOWS and _coherent(*cells) < COHERENT and _peaked(left, heard) < PEAKED
+    return _follows(*cells) > FOLLOWS and _peaked(left, heard) < PEAKED and not _coherent(*cells)
 
 
 def _spectra(x: Samples, size: int, hop: int) -> NDArray[np.complex64]:
@@ -174,14 +173,13 @@ def _follows(said: NDArray[np.complex64], rest: NDArray[np.complex64], whole: ND
     return float(np.sum(a * b) / np.sqrt(np.sum(a * a) * np.sum(b * b) + 1e-12))
 
 
-def _coherent(said: NDArray[np.complex64], rest: NDArray[np.complex64], use: NDArray[np.bool_]) -> float:
-    """The most that one gain of the voice around each cell explains of the residual's power: over PLACES, or shifted by one of SHIFTS."""
-    most = max(_explained(said, rest, use, place) for place in PLACES)
+def _coherent(said: NDArray[np.complex64], rest: NDArray[np.complex64], use: NDArray[np.bool_]) -> bool:
+    """Whether one gain of the voice around each cell explains COHERENT of the residual's power: over PLACES, or shifted by one of SHIFTS."""
+    if any(_explained(said, rest, use, place) >= COHERENT for place in PLACES):
+        return True
     said, rest, use = said[::4], rest[::4], use[::4]
-    for by in SHIFTS:
-        for pair in ((said[:, :-by], rest[:, by:]), (said[:, by:], rest[:, :-by])):
-            most = max(most, _explained(*pair, use, SHIFTED))
-    return most
+    sides = ((said[:, :-by], rest[:, by:]) for by in SHIFTS), ((said[:, by:], rest[:, :-by]) for by in SHIFTS)
+    return any(_explained(*pair, use, SHIFTED) >= COHERENT for pair in chain(*sides))
 
 
 def _explained(

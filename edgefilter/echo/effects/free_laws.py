@@ -14,7 +14,7 @@ from edgefilter.dsp.convolution import filtered
 from edgefilter.dsp.frames import block_power, block_sums, blocks, decibels
 from edgefilter.echo.effect import Effect, Parameter, Runner, Shift, Stage, first, neutral, numbers, vanishes, within
 from edgefilter.echo.effects.gain_fit import EXCERPT, STEP, loudest
-from edgefilter.echo.least_squares import hats, normal_equations
+from edgefilter.echo.least_squares import at_lags, hats, normal_equations
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import fit_filter
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
@@ -338,9 +338,9 @@ def _closer(ground: _Ground, taps: Array) -> Array:
     def heard(taps: Array) -> Samples:
         return ground.part(x + filtered(x, taps, LEAD))
 
-    now, rows = heard(taps), np.empty((taps.size, x.size), np.float32)
-    for row, nudge in zip(rows, NUDGE * np.eye(taps.size), strict=True):
-        row[:] = (heard(taps + nudge) - now) * (weights / NUDGE)
+    now, rows, played = heard(taps), np.empty((taps.size, x.size), np.float32), x + filtered(x, taps, LEAD)
+    for row, late in zip(rows, at_lags(x, taps.size, LEAD).T, strict=True):
+        row[:] = (ground.part(played + np.float32(NUDGE) * late) - now) * (weights / NUDGE)
     left = (ground.target[part] - now) * weights
     normal = (rows @ rows.T).astype(float)
     normal += (1e-4 * np.trace(normal) / taps.size + 1e-30) * np.eye(taps.size)

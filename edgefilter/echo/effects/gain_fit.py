@@ -22,7 +22,7 @@ STEP = 16
 TAPS = 8
 """Of the nuisance filter on each part of the prediction, half of them ahead: what is linear, the make-up gain included."""
 SETTLED = 1e-3
-"""A step of the solver that lowers the cost by less than this part of it is the last."""
+"""A step of the solver that lowers the cost by less than this part of it, or is less than a tenth of it of the unknowns, is the last."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,8 @@ class Reach:
         """Solve for the unknowns with the smallest residual, given its derivatives (slopes); the unknowns, and the energy of what they leave."""
         edge = 1e-3 * self.nudge  # the solver begins inside of its bounds
         start, bounds = np.clip(start, self.lowest + edge, self.highest - edge), (self.lowest, self.highest)
-        found = scipy.optimize.least_squares(residual, start, slopes, bounds, x_scale=self.nudge, ftol=SETTLED)
+        settled = {"ftol": SETTLED, "xtol": 0.1 * SETTLED}
+        found = scipy.optimize.least_squares(residual, start, slopes, bounds, x_scale=self.nudge, **settled)
         return found.x, 2.0 * float(found.cost)
 
 

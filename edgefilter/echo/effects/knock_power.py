@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from typing import TypeAlias
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from edgefilter.dsp.fourier import power
-from edgefilter.dsp.frames import block_sums, frames
+from edgefilter.dsp.frames import frames
 from edgefilter.dsp.psd import GRID_BINS, floored, frequencies, hann
 from edgefilter.echo.effect import NEVER_REACHED
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
+Rises: TypeAlias = tuple[NDArray[np.integer], Samples, Samples]
+"""Samples (k,) at which a displacement rises, and the displacement before each and there, (k,)."""
 FRAME, HOP, BANDS = 128, 64, 16
 """Frames of 8 ms every 4 ms, in bands of 500 Hz: short enough for single knocks."""
 BAND_HZ = SAMPLE_RATE / 2 / BANDS
@@ -66,8 +68,10 @@ def find_trigger(
     best: tuple[float, Trigger | None, Samples] = (-np.inf, None, one)
     for resonance in RESONANCES_HZ:
         moved = resonated(x, resonance, Q)
-        for threshold in quantiles_of_peaks(moved):
-            outward, inward = map(_roughly_ringing, find_knocks(moved, threshold))
+        thresholds = quantiles_of_peaks(moved)
+        sides = rises(moved, min(thresholds))
+        for threshold in thresholds:
+            outward, inward = (_roughly_ringing(knocks_in(rising, threshold), x.size) for rising in sides)
             for side in SIDES:
                 source = one_side((outward, inward), side)
                 source = source / (source.mean() + np.float32(1e-30))
@@ -125,14 +129,10 @@ def _band_of_bins() -> NDArray[np.integer]:
 
 def resonated(x: Samples, resonance_hz: float, q: float, sample_rate: int = SAMPLE_RATE) -> Samples:
     """Displacement of a membrane with that resonance for the drive x (n,), in its full scale, (n,)."""
-    return scipy.signal.lfilter(*_membrane(resonance_hz, q, sample_rate), x).astype(np.float32)
-
-
-@lru_cache(maxsize=64)
-def _membrane(resonance_hz: float, q: float, sample_rate: int) -> tuple[Array, Array]:
-    """Coefficients of that filter; working them out takes ten times as long as filtering a hop."""
-    w = 2.0 * np.pi * resonance_hz
-    return scipy.signal.bilinear([w * w], [1.0, w / q, w * w], sample_rate)
+    k = np.pi * resonance_hz / sample_rate  # by the bilinear transform
+    square, loss = k * k, k / q
+    poles = np.array([1.0 + loss + square, 2.0 * square - 2.0, 1.0 - loss + square])
+    return scipy.signal.lfilter(np.array([1.0, 2.0, 1.0]) * square, poles, x).astype(np.float32)
 
 
 def find_knocks(moved: Samples, threshold: float) -> tuple[Samples, Samples]:
@@ -141,18 +141,23 @@ def find_knocks(moved: Samples, threshold: float) -> tuple[Samples, Samples]:
     The height is the speed over threshold, per millisecond.
     """
     outward, inward = np.zeros_like(moved), np.zeros_like(moved)
-    for train, (at, height) in zip((outward, inward), knocks_at(moved, threshold), strict=True):
+    for train, rising in zip((outward, inward), rises(moved, threshold), strict=True):
+        at, height = knocks_in(rising, threshold)
         train[at] = height
     return outward, inward
 
 
-def knocks_at(moved: Samples, threshold: float) -> list[tuple[NDArray[np.integer], Samples]]:
-    """Samples (k,) and heights (k,) of these knocks, outward and inward: they are few."""
-    found: list[tuple[NDArray[np.integer], Samples]] = []
-    for beyond in (moved > threshold, moved < -threshold):
-        at = 1 + np.flatnonzero(beyond[1:] > beyond[:-1])
-        found.append((at, np.abs(moved[at] - moved[at - 1]) * np.float32(SAMPLE_RATE / 1000 / threshold)))
-    return found
+def rises(moved: Samples, least: float) -> list[Rises]:
+    """All rises of a displacement (n,) to above `least`, outward and inward: the knocks of any higher threshold are among them."""
+    both = [(x, 1 + np.flatnonzero((x[1:] > least) & (x[1:] > x[:-1]))) for x in (moved, -moved)]
+    return [(at, x[at - 1], x[at]) for x, at in both]
+
+
+def knocks_in(rising: Rises, threshold: float) -> tuple[NDArray[np.integer], Samples]:
+    """Samples (k,) and heights (k,) of the knocks among rises: they are few."""
+    at, before, there = rising
+    crossed = (there > threshold) & (before <= threshold)
+    return at[crossed], (there - before)[crossed] * np.float32(SAMPLE_RATE / 1000 / threshold)
 
 
 def one_side(trains: tuple[Array, Array], side: float) -> Array:
@@ -184,9 +189,11 @@ def band_power(x: Samples) -> Samples:
     return bins.reshape(len(bins), BANDS, -1).mean(axis=2).astype(np.float32)
 
 
-def _roughly_ringing(knocks: Samples) -> Samples:
-    """What ringing_of() says of knocks (n,), hop by hop, in each frame, (frames, 1)."""
-    hops = block_sums(np.concatenate((np.zeros(PRE_ROLL), knocks.astype(np.float64) ** 2))[: knocks.size], HOP)
+def _roughly_ringing(knocks: tuple[NDArray[np.integer], Samples], size: int) -> Samples:
+    """What ringing_of() says of knocks in so many samples, their places and heights, hop by hop, in each frame, (frames, 1)."""
+    at, height = knocks
+    count = size // HOP
+    hops = np.bincount((at + PRE_ROLL) // HOP, np.square(height, dtype=np.float64), count)[:count]
     keep = np.exp(-HOP / (DECAYS_MS[0] * 1e-3 * SAMPLE_RATE))
     rung = scipy.signal.lfilter([1.0], [1.0, -keep], hops)
     return (rung[:-1] + rung[1:]).astype(np.float32)[:, None]

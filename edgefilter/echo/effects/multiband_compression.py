@@ -125,8 +125,10 @@ class _Crossover:
     """What lies below and above a frequency, on a stream: Butterworth filters of second order, twice each."""
 
     def __init__(self, hz: float, sample_rate: int) -> None:
-        kinds = (scipy.signal.butter(2, hz, kind, fs=sample_rate, output="sos") for kind in ("low", "high"))
-        self._filters = [np.tile(sos, (2, 1)) for sos in kinds]
+        k = np.tan(np.pi * hz / sample_rate)
+        poles = np.array([k * k + np.sqrt(2.0) * k + 1.0, 2.0 * k * k - 2.0, k * k - np.sqrt(2.0) * k + 1.0])
+        zeros = k * k * np.array([1.0, 2.0, 1.0]), np.array([1.0, -2.0, 1.0])
+        self._filters = [np.tile(np.concatenate((each, poles)) / poles[0], (2, 1)) for each in zeros]
         self._memory = [np.zeros((2, 2)), np.zeros((2, 2))]
 
     def __call__(self, x: Samples) -> tuple[Samples, Samples]:
@@ -180,10 +182,10 @@ def _moved(x: Samples, delay: float) -> Samples:
 
 
 def _halves(hz: Array, crossover_hz: float) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-    """Responses below and above a crossover, (m,) each."""
-    kinds = (scipy.signal.butter(2, crossover_hz, kind, fs=SAMPLE_RATE) for kind in ("low", "high"))
-    low, high = (scipy.signal.freqz(b, a, hz, fs=SAMPLE_RATE)[1] ** 2 for b, a in kinds)
-    return low, high
+    """Responses below and above a crossover, (m,) each: of _Crossover's filters in closed form."""
+    s = 1j * np.tan(np.pi * hz / SAMPLE_RATE) / np.tan(np.pi * crossover_hz / SAMPLE_RATE)
+    rest = (s * s + np.sqrt(2.0) * s + 1.0) ** 2
+    return 1.0 / rest, s**4 / rest
 
 
 def _start(loud_db: float, below_db: float, slope: float, attack: float, release: float) -> Array:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, replace
-from functools import lru_cache
 from itertools import product
 
 import numpy as np
@@ -27,11 +27,12 @@ from edgefilter.echo.effects.knock_power import (
     find_knocks,
     find_trigger,
     frames_to_fit,
-    knocks_at,
+    knocks_in,
     one_side,
     quantiles_of_peaks,
     resonated,
     ringing_of,
+    rises,
 )
 from edgefilter.echo.least_squares import absorbed
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
@@ -44,6 +45,9 @@ RIDGE = 1e-2
 neighbouring taps can hardly be told apart."""
 WORTH = 2.5
 """What each tap has to explain, in units of the residual's variance, for the sounds to be real."""
+ANYWHERE = [Trigger(hz, q, NEVER_REACHED, 0.0) for hz, q in product(RESONANCES_HZ, (0.7, 1.0, 1.6))]
+NEAR = (0.7, 0.8, 0.9, 0.96, 1.0, 1.04, 1.1, 1.2, 1.35)
+"""Membranes on which the trigger is looked for anew, either side knocking, and then thresholds re the one that was found."""
 REFINED = 3
 """Times at most that the trigger is looked for anew with the sounds found."""
 
@@ -118,7 +122,7 @@ class Rattle(Effect):
             hits = [
                 _matched(sound, rest, measurement, model) * allowed if sound.any() else allowed[:0] for sound in sounds
             ]
-            other = _best_agreement(x, hits, _fine(at) if again else _coarse(x))
+            other = _best_agreement(x, hits, _near(at), NEAR) if again else _best_agreement(x, hits, ANYWHERE)
             gain_then, sounds_then = explain(other)
             if gain_then > gain:
                 at, gain, sounds = other, gain_then, sounds_then
@@ -183,28 +187,24 @@ def _matched(sound: Array, rest: Samples, measurement: Measurement, model: Voice
     return convolve(rest, heard[::-1])[length - 1 - at :][: rest.size].astype(np.float32)
 
 
-def _coarse(x: Samples) -> list[Trigger]:
-    """All over the range, either side knocking."""
-    moved = [(hz, q, resonated(x, hz, q)) for hz, q in product(RESONANCES_HZ, (0.7, 1.0, 1.6))]
-    return [Trigger(hz, q, threshold, 0.0) for hz, q, d in moved for threshold in quantiles_of_peaks(d)]
+def _near(at: Trigger) -> list[Trigger]:
+    """A trigger and others of a slightly other membrane."""
+    steps = product((0.85, 0.92, 0.96, 1.0, 1.04, 1.09, 1.18), (0.75, 1.0, 1.3))
+    return [replace(at, resonance_hz=at.resonance_hz * a, q=at.q * b) for a, b in steps]
 
 
-def _fine(at: Trigger) -> list[Trigger]:
-    """Neighbours of a trigger."""
-    steps = product(
-        (0.85, 0.92, 0.96, 1.0, 1.04, 1.09, 1.18), (0.75, 1.0, 1.3), (0.7, 0.8, 0.9, 0.96, 1.0, 1.04, 1.1, 1.2, 1.35)
-    )
-    return [replace(at, resonance_hz=at.resonance_hz * a, q=at.q * b, threshold=at.threshold * c) for a, b, c in steps]
-
-
-def _best_agreement(x: Samples, hits: list[Samples], choices: list[Trigger]) -> Trigger:
-    """The one whose knocks fit the matched filter's output best; neighbours in resonance and q follow each other."""
-
-    @lru_cache(maxsize=1)
-    def moved(resonance_hz: float, q: float) -> Samples:
-        return resonated(x, resonance_hz, q)
-
-    return max(choices, key=lambda at: _agreement(knocks_at(moved(at.resonance_hz, at.q), at.threshold), hits))
+def _best_agreement(x: Samples, hits: list[Samples], membranes: list[Trigger], shares: Sequence[float] = ()) -> Trigger:
+    """The one whose knocks fit the matched filter's output best, of thresholds that are shares of each one's own, or of its peaks."""
+    best, most = membranes[0], -np.inf
+    for one in membranes:
+        moved = resonated(x, one.resonance_hz, one.q)
+        thresholds = [one.threshold * share for share in shares] or quantiles_of_peaks(moved)
+        sides = rises(moved, min(thresholds))
+        for threshold in thresholds:
+            agreement = _agreement([knocks_in(rising, threshold) for rising in sides], hits)
+            if agreement > most:
+                best, most = replace(one, threshold=threshold), agreement
+    return best
 
 
 def _agreement(knocks: list[tuple[NDArray[np.integer], Samples]], hits: list[Samples]) -> float:
@@ -244,8 +244,8 @@ def _solve(matrix: Array, right: Array) -> Array:
 def _normal(columns: list[Samples], residual: Samples, taps: int) -> tuple[Array, Array]:
     """Normal equations (C taps, C taps), (C taps,) from correlations: for many taps faster than by normal_equations()."""
     n = scipy.fft.next_fast_len(residual.size + taps, real=True)
-    spectra = [scipy.fft.rfft(c.astype(np.float64), n) for c in columns]
-    target = scipy.fft.rfft(residual.astype(np.float64), n)
+    spectra = [scipy.fft.rfft(c, n) for c in columns]
+    target = scipy.fft.rfft(residual, n)
     right = np.concatenate([scipy.fft.irfft(np.conj(s) * target, n)[:taps] for s in spectra])
     lags = [[scipy.fft.irfft(np.conj(a) * b, n) for b in spectra] for a in spectra]
     square = [[scipy.linalg.toeplitz(r[:taps], np.append(r[:1], r[:-taps:-1])) for r in row] for row in lags]

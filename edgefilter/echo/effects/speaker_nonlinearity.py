@@ -85,7 +85,7 @@ class SpeakerNonlinearity(Effect):
             measurement.weights,
             linear,
             lambda sound: measurement.heard(model, sound),
-            excerpt=excerpt(measurement, model, EXCERPT) if x.size >= 1.5 * EXCERPT else None,
+            excerpt(measurement, model, EXCERPT),
         )
         if found is None:
             return neutral(self)
@@ -162,29 +162,24 @@ def fit_laws(
     weights: Samples,
     linear: Samples,
     hear: Callable[[Samples], Samples],
-    excerpt: slice | None = None,
+    excerpt: slice,
 ) -> dict[str, float | Array] | None:
     """The effect's values that explain a recording best, bounds aside; None where no law holds on samples that it was not fitted to.
 
     x: (n,) what the amplifier is sent. target: (n,) the recording, whitened. weights: (n,) 0 to 1. linear: (n,) hear(x).
     hear: what becomes of a signal (n,) at the loudspeaker up to the microphone, whitened. excerpt: the samples on which
-    resonance, excursion and knee are chosen; None: all.
+    resonance, excursion and knee are chosen.
     """
-    search = _Search(x, hear, _Halves(linear, target, weights))
-    if search.silent:
+    part = _Search(x[excerpt], hear, _Halves(linear[excerpt], target[excerpt], weights[excerpt]))
+    if part.silent:
         return None
-    if excerpt is None:
-        bend, move = search.amplifier(), search.driver()
-    else:
-        part = _Search(x[excerpt], hear, _Halves(linear[excerpt], target[excerpt], weights[excerpt]))
-        if part.silent:
-            return None
-        bend, move = part.amplifier(), part.driver()
-        if not (part.promising(bend) or part.promising(move)):
-            return None
-        chosen = [(found.setting, found.scale) for found in (bend, move)]
-        del part, bend, move  # their columns are as large as those of all samples, which come next
-        bend, move = (search.part(*each) for each in chosen)
+    bend, move = part.amplifier(), part.driver()
+    if not (part.promising(bend) or part.promising(move)):
+        return None
+    chosen = [(found.setting, found.scale) for found in (bend, move)]
+    del part, bend, move  # their columns are as large as those of all samples, which come next
+    search = _Search(x, hear, _Halves(linear, target, weights))
+    bend, move = (search.part(*each) for each in chosen)
     parts = [min(move, bend, key=_by_left)]
     left, together = parts[0].left, search.halves.left(move.columns, bend.columns)
     if together < (1.0 - FURTHER) * left:
