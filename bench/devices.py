@@ -88,7 +88,7 @@ def run(options: argparse.Namespace) -> str:
 
 def levels(options: argparse.Namespace) -> str:
     many = ", ".join(f"{level:g}" for level in options.levels)
-    return f"Humans are {' to '.join(f'{ser:g}' for ser in options.ser)} dB over the echo, on devices of many recordings {many}."
+    return f"Humans are {' to '.join(f'{ser:g}' for ser in options.ser)} dB over the echo; on devices with many recordings, at each of {many} dB."
 
 
 def find_clips(options: argparse.Namespace) -> list[Clip]:

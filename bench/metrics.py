@@ -104,11 +104,12 @@ def _aecmos() -> Callable | None:
 
 
 def score(clip: Clip, output: Output, cached: CachedMetrics) -> dict:
-    """All figures of one system on one clip; "problem" in place of what an unusable output makes impossible.
+    """All figures of one system on one clip; "problem" replaces those that an unusable output rules out.
 
     si_sdr, estoi and the words are over the span in which the human speaks; erle_db over the ALONE_S before it, or over
-    the whole of a recording in which nobody speaks, where erle_frames_db is the median of its frames; excess_db is the most
-    by which a second is louder than the microphone; delay_s and early, or false_starts, for systems that tell events.
+    the whole of a recording in which nobody speaks, which also has erle_frames_db, the median over its frames; excess_db is by
+    how much the output exceeds the microphone in the second where it does most. Systems that tell events also have delay_s and
+    early, or false_starts where nobody speaks.
     """
     out, mic, ref = output.samples, clip.mic, clip.ref
     row: dict = {"duration": mic.size / SAMPLE_RATE}

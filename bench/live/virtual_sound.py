@@ -126,7 +126,7 @@ def processor_s(pid: int) -> float:
 
 
 def children(pid: int) -> list[int]:
-    """All processes that it started, and that these started: of a running filter, the learner's."""
+    """The process numbers of all descendants; those of a running filter are its learner's processes."""
     try:
         listed = [path.read_text().split() for path in Path(f"/proc/{pid}/task").glob("*/children")]
     except (FileNotFoundError, ProcessLookupError):

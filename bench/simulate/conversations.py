@@ -158,7 +158,7 @@ def make_scene(
     distortion: str = "moderate",
     microphone: str | None = None,
 ) -> Scene:
-    """Item index of this seed: signals (n,) float64 and the contents of meta.json; the same but for what the microphone changes."""
+    """Item number index of this seed: signals (n,) float64 and the contents of meta.json. Whatever the microphone, all else of it is the same."""
     rng = np.random.default_rng([seed, index])
     human_clip = speech[np.random.default_rng(seed).permutation(len(speech))[index % len(speech)]]
     voice = str(rng.choice(sorted(voices)))

@@ -1,7 +1,7 @@
-"""What else a microphone may do to a conversation, or hear in it: nothing that the filter was tuned for.
+"""Microphones that process their sound, and noises beside a conversation, on none of which the filter was tuned.
 
-Written by other means than the training's microphones and motors (export/simulate): bands in place of a short-time
-spectrum, a rectifier's hum, gestures in place of an envelope.
+They are simulated in another way than those of the training (export/simulate): the gains are of bands in place of a short-time
+spectrum, the hum is a rectifier's, and motors follow gestures in place of the voice's envelope.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def processed(rng: Rng, signals: Signals, voice: Array) -> Signals:
 
 
 def _processed(depth_db: float, ratio: float, mean_db: float, mic: Array, *parts: Array) -> list[Array]:
-    """The microphone (n,) and its parts, under the gains that it gets in each band and in all."""
+    """The microphone and its parts, (n,) each, under the same gains: one of each band against noise, and one of all against the level."""
     lows = [np.zeros(255), *(signal.firwin(255, hz, fs=RATE) for hz in EDGES_HZ), np.eye(1, 255, 127)[0]]
     out = [np.zeros(mic.size) for _ in (mic, *parts)]
     for taps in np.diff(lows, axis=0):

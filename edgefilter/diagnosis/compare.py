@@ -32,16 +32,16 @@ Rows: TypeAlias = tuple[tuple[float, float, float], ...]
 class Comparison:
     """A recording against its prediction.
 
-    Decibels of excess are of the residual, whitened by the fan's PSD, over the fan.
+    Excess is the power of the residual over the fan's, dB, both whitened by the fan's PSD.
 
-    excess_db: of the samples that no diagnosis fits on, every second half second, as Straightened scores them: the one figure
-    that compare, add, diagnose and the report show; 0 means that nothing is unexplained. All else is of the whole.
+    excess_db: over the samples that no fit has used, alternate half seconds, as Straightened scores them: the one figure that
+    compare, add, diagnose and the report show; 0 means that nothing is unexplained. All else is over the whole recording.
     noise_floor_db: the fan, dB re full scale. bands: (low_hz, high_hz, excess_db). times: (start_s, end_s, excess_db).
     levels: (low_dbfs, high_dbfs, excess_db) by the level of the predicted voice. lags: (low_ms, high_ms, share) of the
     residual's correlation with the reference, by lag. silence_excess_db: while the robot is silent; nan where it never
-    is. human: (start_s, end_s) where somebody talks, left out. offset_samples: lag of the recording against the
-    calibration, constant. recording, prediction, residual: (n,), aligned. independence: whether the residual is white
-    and independent of the reference; None for less than a second of the robot. drift_ppm: how much faster the microphone's
+    is. human: (start_s, end_s) that are left out, since somebody talks. offset_samples: constant lag of the recording
+    relative to the calibration. recording, prediction, residual: (n,), aligned. independence: whether the residual is white
+    and independent of the reference; None where the robot talks for less than a second. drift_ppm: how much faster the microphone's
     clock runs than the reference's, where that is taken out.
     """
 

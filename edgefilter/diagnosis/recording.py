@@ -104,7 +104,7 @@ class Recording:
         return HeldOut(self._given, self.straightened, self.mic, self.reference)
 
     def compare(self) -> Comparison:
-        """Say how far the profile's prediction is from the recording, and where, once the clocks' drift is taken out: `compare`."""
+        """Say how far the profile's prediction is from the recording, and where, with the clocks' drift taken out; as the function `compare`."""
         prepared, start = self.straightened, self.straightened.model
         bench = Workbench(prepared, Criteria())
         lags = (

@@ -145,12 +145,12 @@ class BargeIn:
     Speech is suspected in the first hop that reaches the threshold, which `OwnVoice` raises or lowers for this robot. By how much
     the log-odds of the hops that follow exceed it is added up (Wald 1945, "Sequential tests of statistical hypotheses"): at the
     bounds of an ERROR, or by the sum's sign when the time to confirm is over, speech has begun, or the suspicion is dismissed. Where the
-    robot lowers its voice meanwhile, those bounds only tell whether anybody speaks, human or robot. It is a human where the sum reaches the
+    robot lowers its voice to ask who speaks, those bounds only tell whether anybody does, human or robot. It is a human where the sum reaches the
     bound of UNASKED, or where speech goes on once the lower voice is heard at the microphone: from that moment on the sum begins
     anew and never falls below 0 (Page 1954, "Continuous inspection schemes"); if it does not reach the upper bound within
-    the time to confirm, it was the robot. A suspicion within QUESTIONS_S of such a question asks none, and the sum alone decides.
-    hop_s: seconds between two probabilities. settings: None for the defaults. calibrated: whether the robot is, and before: with what
-    count of `own`, the rate at which it is taken for a human.
+    the time to confirm, it was the robot. Within QUESTIONS_S of such a question none is asked, and the sum alone decides.
+    hop_s: seconds between two probabilities. settings: None for the defaults. calibrated: whether the robot is. before: how often it
+    was taken for a human during its calibration, for `own` to go on from.
 
     >>> talk = BargeIn(0.016)
     >>> [talk.note(probability) for probability in (0.2, 0.98, 0.99, 0.995, 0.995)]

@@ -39,10 +39,10 @@ Verdict = Literal["unknown", "fits", "late"]
 
 
 class ReferenceWatch:
-    """Says what is wrong with the reference, once each time it begins, by what the aligner believes and how loud both channels are.
+    """Reports each fault of the reference once, when it begins, from the aligner's belief and the levels of both channels.
 
-    hop: samples a step. bins: of a spectrum. verdict: "late" or "fits" once either is certain. without: whether the robot is
-    heard while the reference is silent. same: whether microphone and reference are one signal.
+    hop: samples a step. bins: their number in a spectrum. verdict: "unknown" until it is certain that the reference fits or is
+    late. without: whether the robot is heard while the reference is silent. same: whether microphone and reference are one signal.
 
     >>> watch = ReferenceWatch(256, 257)
     >>> watch.verdict, watch.wait
@@ -103,7 +103,7 @@ class ReferenceWatch:
         self._loudest = max(self._loudest, self._sustained.step(power))
         if power > LAST_BIT:
             self._least = min(power, self._rise * self._least)
-        # of each cause what is to be said while it lasts, "" once it has certainly ended, and None where neither is known
+        # each fault, and its message while it lasts, "" once it has certainly ended, None while that is unknown
         causes: tuple[tuple[EventKind, str | None], ...] = (
             ("reference_late", self._late_by(aligned.belief, aligned.past)),
             ("robot_unfound", self._far_behind()),

@@ -52,11 +52,11 @@ _default = _options([])
 
 @dataclass(eq=False, repr=False)
 class HumanConf(SICConfMessage):
-    """What `Human(conf=...)` may say; what it leaves out is as the component's command line says.
+    """Options of `Human(conf=...)`; those left out are taken from the component's command line.
 
-    profile: file of the calibrated robot, where the component runs. engine: as of `EgoFilter`. channels: of the
-    microphone's sound, interleaved, of which a message does not tell how many it has. mic_channels: as of `Duplex`.
-    confirm_s, ask_db, threshold: as of `BargeInSettings`.
+    profile: file of the calibrated robot, on the component's machine. engine: as in `EgoFilter`. channels: how many the
+    microphone's sound interleaves, which its messages do not tell. mic_channels: as in `Duplex`. confirm_s, ask_db,
+    threshold: as in `BargeInSettings`.
     """
 
     profile: str | None = None

@@ -70,14 +70,14 @@ class Limits:
 
 @dataclass(frozen=True)
 class Form:
-    """How a device sends: the first message.
+    """A device's first message: how it sends.
 
     rate: Hz, of the samples and of the counters. streams: "stereo", microphone and reference interleaved, or "two",
-    each message of one stream, with a HEADER. microphones: of an array, interleaved, in "stereo" before the reference.
-    codec: "pcm", 16 bit, or "opus", mono, at a rate of 48000 and in two streams. late_ms: how long the microphone waits
-    for a late reference. learn: whether to learn the room. bitrate: bits a second of the answer in Opus. output: which
-    of the filter's sounds is the answer. ask_db: as of `BargeInSettings`, whole dB. queued_ms: from
-    when the microphone has heard a sound until the loudspeaker plays with the gain that the answer asks for.
+    each message of one stream, with a HEADER. microphones: how many, interleaved; in "stereo" they precede the reference.
+    codec: "pcm", 16 bit, or "opus", mono, only at 48000 Hz and in "two". late_ms: how long the microphone's sound is held
+    back for a late reference. learn: whether to learn the room. bitrate: bits a second of the answer in Opus. output: which
+    of the filter's sounds is the answer. ask_db: as in `BargeInSettings`, whole dB. queued_ms: time from when the
+    microphone has heard a sound until the loudspeaker plays at the gain that the answer asks for.
     """
 
     rate: int = SAMPLE_RATE

@@ -55,7 +55,7 @@ TERMS = {
         "Held out": "every second half second: no fit has used it, so that an effect that is not there gains nothing."
     },
 }
-"""What the page's words mean, by the section that they stand beside."""
+"""The page's glossary: terms and their meanings by the section beside which they stand."""
 
 Choice = tuple[bool, ...]
 

@@ -142,7 +142,7 @@ def _compared(found: Comparison) -> list[str]:
 
 
 def apart(drift_ppm: float) -> str:
-    """Format how fast a clock runs, such as "43.0 ppm slower"."""
+    """Format how much faster (above 0) or slower the microphone's clock runs than the reference's, such as "43.0 ppm slower"."""
     return f"{abs(drift_ppm):.1f} ppm {'faster' if drift_ppm > 0 else 'slower'}"
 
 

@@ -77,7 +77,7 @@ class Pool(Items):
 
 
 class Keeper(Trainer):
-    """A trainer that puts weights and log where they outlast the machine, at each validation, and the weights each KEEP_S."""
+    """A trainer that copies weights and log to a folder that outlasts the machine, at each validation; the weights also every KEEP_S seconds."""
 
     keep: Path
 

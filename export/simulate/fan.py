@@ -18,7 +18,7 @@ CHANGING, RECORDED, BACKGROUND, TALKERS = 0.2, 0.3, 0.2, 0.4
 """Shares of wide items whose fan changes its speed, whose fan is a recording, with something sounding in the background
 besides, and, of the last, those in which that is people."""
 KNOCKS, KNOCK_S, KNOCK_DB = 4, (0.03, 0.4), (-10.0, 5.0)
-"""How many an item has at most, how long each is, from a key to a cough, and over the human."""
+"""Most knocks in an item, the seconds that one lasts (a key to a cough), and its dB over the human."""
 
 
 def noise(
@@ -76,7 +76,7 @@ def motors(rng: np.random.Generator, material: Material, played: Samples, rms: f
 
 
 def knocks(rng: np.random.Generator, material: Material, clean: Samples, rms: float) -> Samples:
-    """Pieces of noises about their loudest moment (n,), at KNOCK_DB over that RMS, each from where the human (n,) is silent on."""
+    """Short noises (n,), cut about their loudest moment, KNOCK_DB over rms; each begins where the human, clean (n,), is silent."""
     total = np.zeros(clean.size, np.float32)
     silent = np.flatnonzero(maximum_filter1d(np.abs(clean), SAMPLE_RATE // 10) <= 1e-3 * np.abs(clean).max())
     for at in rng.choice(silent, rng.integers(1, KNOCKS + 1)) if silent.size else ():

@@ -120,9 +120,9 @@ DEVICES = replace(VOICES, processed=0.2, later=0.03, setting=WideSetting(lost=0.
 """VOICES with devices on which no linear stage helps: what is left is the reference's magnitudes, about aligned."""
 FIELD = replace(DEVICES, motors=0.2, hum=0.1, soft=0.3, knocks=0.3, distortion_db=(-45.0, -5.0), plain=0.2)
 """DEVICES with robots that move while they talk, cheap microphones and louder distortion; with humans who begin softly, since
-recordings are cut where they are 34 dB below their peak and all others begin at once; and with short sounds as loud as
-humans, which else were always the human. References are intact: a network that was trained with some that had stopped took a
-loud human beside a silent reference for the robot (real2's gf_655836)."""
+recordings of speech are trimmed at 34 dB below their peak, and so begin abruptly; and with short sounds as loud as a human,
+since in other recipes every sound as loud is a human. References never stop: a network that was trained with some that did
+took a loud human beside a silent reference for the robot (gf_655836 in real2)."""
 RECIPES = {
     "edge": BENCHMARK,
     "paper": PAPER,

@@ -22,8 +22,8 @@ SMOOTH = np.array([0.25, 0.5, 0.25])
 class FanNoise(Effect):
     """S(f) = 10^(spectrum_db(f) / 10) S0(f), S0 the calibrated power spectral density of the fan; the voice is unchanged.
 
-    spectrum_db: (601,) on the profile's grid, 0 to 8 kHz, or one number. change_db only reports: the change of the
-    fan's total power. from_s: when it changes, in the recording that it was fitted to; in others it is as it became.
+    spectrum_db: (601,) on the profile's grid, 0 to 8 kHz, or one number. change_db: change of the fan's total
+    power, for reports only. from_s: when the change begins in the recording that was fitted to; in others it holds throughout.
     """
 
     name = "fan_noise"

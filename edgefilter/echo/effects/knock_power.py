@@ -190,7 +190,7 @@ def band_power(x: Samples) -> Samples:
 
 
 def _roughly_ringing(knocks: tuple[NDArray[np.integer], Samples], size: int) -> Samples:
-    """What ringing_of() says of knocks in so many samples, their places and heights, hop by hop, in each frame, (frames, 1)."""
+    """About what ringing_of() gives, (frames, 1), for knocks (places, heights) in size samples, whose power is summed by hops."""
     at, height = knocks
     count = size // HOP
     hops = np.bincount((at + PRE_ROLL) // HOP, np.square(height, dtype=np.float64), count)[:count]

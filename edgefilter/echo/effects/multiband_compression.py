@@ -182,7 +182,7 @@ def _moved(x: Samples, delay: float) -> Samples:
 
 
 def _halves(hz: Array, crossover_hz: float) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-    """Responses below and above a crossover, (m,) each: of _Crossover's filters in closed form."""
+    """Frequency responses (m,) of _Crossover's lowpass and highpass, in closed form."""
     s = 1j * np.tan(np.pi * hz / SAMPLE_RATE) / np.tan(np.pi * crossover_hz / SAMPLE_RATE)
     rest = (s * s + np.sqrt(2.0) * s + 1.0) ** 2
     return 1.0 / rest, s**4 / rest

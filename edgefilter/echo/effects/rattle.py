@@ -188,7 +188,7 @@ def _matched(sound: Array, rest: Samples, measurement: Measurement, model: Voice
 
 
 def _near(at: Trigger) -> list[Trigger]:
-    """A trigger and others of a slightly other membrane."""
+    """The trigger, and such whose membrane resonates at a slightly other frequency or with another quality."""
     steps = product((0.85, 0.92, 0.96, 1.0, 1.04, 1.09, 1.18), (0.75, 1.0, 1.3))
     return [replace(at, resonance_hz=at.resonance_hz * a, q=at.q * b) for a, b in steps]
 
