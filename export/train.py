@@ -35,7 +35,7 @@ from export.onnx_export import load
 from export.paper_network import PaperCrnn
 from export.step_times import table
 from export.tasks import TASKS, EdgeTask, PaperTask
-from export.trainer import Plan, Trainer
+from export.trainer import HALF, Plan, Trainer
 
 
 def smoke(options: argparse.Namespace) -> None:
@@ -110,7 +110,8 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--start", type=Path, metavar="CHECKPOINT", help="weights to begin with")
     parser.add_argument("--times", action="store_true", help="say where the time of a step goes, and train nothing")
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--full-precision", action="store_true", help="float32 instead of bfloat16 in the forward pass")
+    told = "float32 instead of bfloat16 in the forward pass; always where only that is computed in hardware"
+    parser.add_argument("--full-precision", action="store_true", default=not HALF, help=told)
     parser.add_argument(
         "--smoke", action="store_true", help="make a few seconds of data in --data and --validation and take four steps"
     )

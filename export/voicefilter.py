@@ -24,7 +24,7 @@ from edgefilter.errors import EdgefilterError
 from export.corpus import read_corpus
 from export.crops import Shape
 from export.onnx_export import load
-from export.trainer import Plan
+from export.trainer import HALF, Plan
 from export.voicefilter_mixtures import Mixtures, Voices, read_items
 from export.voicefilter_network import VoiceFilterConfig
 from export.voicefilter_onnx import export, rounded
@@ -51,7 +51,8 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--channels", type=int, default=VoiceFilterConfig.channels)
     parser.add_argument("--hidden", type=int, default=VoiceFilterConfig.hidden)
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--full-precision", action="store_true", help="float32 instead of bfloat16 in the forward pass")
+    told = "float32 instead of bfloat16 in the forward pass; always where only that is computed in hardware"
+    parser.add_argument("--full-precision", action="store_true", default=not HALF, help=told)
     return parser.parse_args(argv)
 
 
