@@ -126,7 +126,9 @@ def test_every_device_has_its_row(pairs: Path, speech: Path, tmp_path: Path) -> 
     assert lowered["device1"][0] == pytest.approx(0.0) and lowered["device1"][1] > 10  # an echo of one tap
     at = table(part, "headline")["columns"].index("median frame")
     assert kept["Unfiltered"][at]["mean"] == pytest.approx(0.0) and kept["linear, uncalibrated"][at]["mean"] > 10
-    assert part["notes"].endswith("Humans are -14 to -6 dB over the echo; on devices with many recordings, at each of -10 dB.")
+    assert part["notes"].endswith(
+        "Humans are -14 to -6 dB over the echo; on devices with many recordings, at each of -10 dB."
+    )
     assert "by more than 1 dB of SI-SDR on" in table(part, "peers")["text"]
     assert [row[0] for row in table(part, "interrupts-headline")["rows"]] == ["crnn, uncalibrated"]
     assert [row[0] for row in table(part, "barge-in")["rows"]] == ["x (tuned on)", "device1"][::-1]
