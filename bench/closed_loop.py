@@ -9,10 +9,9 @@ import numpy as np
 import soundfile
 
 from edgefilter import EgoFilter, Event, Profile
-from edgefilter.alignment.aligner import COARSE_MARGIN
 from edgefilter.closed_loop import closed_loop
 from edgefilter.filter.barge_in import BargeInSettings
-from edgefilter.types import SAMPLE_RATE, Samples
+from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 
 
 class Output(NamedTuple):
@@ -66,4 +65,4 @@ def recorded(mic: Samples, ref: Samples, ask_db: float) -> Robot | None:
     ego.process(mic, ref)
     found = ego.stats()["alignment"]
     late, wide = (found["delay_samples"], found["deviation_samples"]) if found else (None, None)
-    return None if late is None or wide == COARSE_MARGIN else Robot(mic, round(late), ask_db)
+    return None if late is None or wide > PRE_ROLL else Robot(mic, round(late), ask_db)

@@ -157,7 +157,7 @@ class AlignmentStats(AlignmentCounts, total=False):
 
     Method "tracking" has all keys but utterances_aligned; "paper" has the first, delay_samples, confidence and
     utterances_aligned. probability: that the delay is right, 0 to 1; deviation_samples: the standard deviation of the
-    delay if it is, of a coarse one 25 ms. confidence: of "tracking" the probability under its earlier name, of "paper" a correlation.
+    delay if it is. confidence: of "tracking" the probability under its earlier name, of "paper" a correlation.
     """
 
     method: Literal["tracking", "paper"]

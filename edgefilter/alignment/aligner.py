@@ -142,9 +142,7 @@ class Aligner:
         self._to_search, self._to_measure = SEARCH_STRIDE, STRIDE // 2
         self._gain: float | None = None
         self._by_bands = None if self._calibrated else CoarseLag(self.hop, self._max_lag)
-        self._coarse = False  # whether a lag is followed at which nothing sharp arrives
         self._margin = PRE_ROLL
-        self._known = self._refuted = self._measured = False
         self._log_odds = 0.0  # of the delay; below 0 also where none is known and an utterance was not heard
         self._lost = 0  # measurements in a row that have not seen the robot
         self._counts = AlignmentCounts(
@@ -186,14 +184,14 @@ class Aligner:
                 self._steps, self._to_search, self._expected = iter(()), 0, None
         if self._open:
             self._expire()
-        before, switched, self._measured = self._read_at, False, False
-        if self._known or self._coarse:
+        before, jumped = self._read_at, None
+        if self._located:
             self._drift.advance(self.hop)
-            switched = self._measure()
-        if self._by_bands and not self._known:
-            switched = self._look_coarsely(mic, ref, self._by_bands) or switched
-        switched = self._search() or switched
-        aligned = self._deliver(mic, before, switched)
+            jumped = self._measure()
+        moved = self._by_bands and not self._known and self._look_coarsely(mic, ref, self._by_bands)
+        self._to_search -= self.hop
+        found = jumped is None and self._search()  # both cost too much for one hop
+        aligned = self._deliver(mic, before, bool(jumped or moved or found))
         past = Past(self._mics[self._used[0]], self._ref, self._onsets)
         return aligned._replace(past=past, belief=self._believe(aligned))
 
@@ -229,31 +227,49 @@ class Aligner:
         """Whether a search is to be believed, also against a lag that is certain but not followed."""
         return found.odds > CERTAIN * (CERTAIN if self._displaced else 1.0)
 
+    @property
+    def _located(self) -> bool:
+        """Whether a lag is followed, sharp or coarse."""
+        return self._drift.shared < math.inf
+
+    @property
+    def _known(self) -> bool:
+        """Whether the lag that is followed is that of a sharp arrival."""
+        return self._drift.shared == 0.0
+
+    @property
+    def _coarse(self) -> bool:
+        """Whether a lag is followed at which nothing sharp arrives."""
+        return 0.0 < self._drift.shared < math.inf
+
+    @property
+    def _refuted(self) -> bool:
+        """Whether the oldest utterance that is looked for does not come at the lag that is followed."""
+        return bool(self._open) and self._open[0].refuted
+
     def _look_coarsely(self, mic: Samples, ref: Samples, by_bands: CoarseLag) -> bool:
         """Find where the reference is to be read as long as nothing sharper is known; True if that is elsewhere than before."""
         by_bands.step(mic, ref)
         found = by_bands.find()
-        if found is None or (self._coarse and abs(found - self._drift.delay) <= COARSE_MARGIN):
+        if found is None or (self._coarse and abs(found[0] - self._drift.delay) <= COARSE_MARGIN):
             return False
-        self._coarse, self._margin = True, COARSE_MARGIN
-        self._meter = DelayMeter()
-        self._drift.restart(float(found))
+        self._meter, self._margin = DelayMeter(), COARSE_MARGIN
+        self._drift.restart(float(found[0]), shared=found[1])
         return True
 
     def history(self, count: int) -> Samples:
         """The last count aligned samples (count,) float32, the present hop included, as if the present delay had always held."""
-        if not (self._known or self._coarse) or self._refuted:
+        if not self._located or self._refuted:
             return np.zeros(count, np.float32)
         return read_line(self._ref, self._ref.end, count, self._read_at, self._drift.slope, chunk=512)
 
     def stats(self) -> AlignmentStats:
         """Delay, drift, how sure both are, state and what happened so far, ready for JSON."""
-        deviation = COARSE_MARGIN if self._coarse else round(self._drift.deviation, 3)
         return {
             "method": "tracking",
             "state": self._state(),
-            "delay_samples": round(self._drift.delay, 3) if self._known or self._coarse else None,
-            "deviation_samples": deviation if self._known or self._coarse else None,
+            "delay_samples": round(self._drift.delay, 3) if self._located else None,
+            "deviation_samples": round(self._drift.deviation, 3) if self._located else None,
             **self._counts,
             "ppm": round(-1e6 * self._drift.slope, 2),
             "probability": round(self._probability, 3),
@@ -301,13 +317,9 @@ class Aligner:
     def _resolve(self) -> None:
         self._open.popleft()
         self._steps = iter(())
-        self._refuted = False
 
     def _search(self) -> bool:
         """A step of a search over all lags each hop, to be looked at by itself or for an utterance; True if the delay was switched."""
-        self._to_search -= self.hop
-        if self._measured:
-            return False
         switched = next(self._steps, None)
         if switched is None:
             now = self._ref.end
@@ -410,19 +422,17 @@ class Aligner:
         return self._switched()
 
     def _switched(self) -> bool:
-        self._known, self._coarse = True, False
         self._counts["realignments"] += 1
-        self._lost, self._refuted = 0, False
+        self._lost = 0
         self._to_measure = min(self._to_measure, 2 * self.hop)
         return True
 
-    def _measure(self) -> bool:
-        """Now and then measure the error of the present delay; True if it jumped."""
+    def _measure(self) -> bool | None:
+        """Now and then measure the error of the present delay; True if it jumped, None in other hops."""
         self._to_measure -= self.hop
-        self._measured = self._to_measure <= 0
-        if not self._measured:
+        if self._to_measure > 0:
             self._meter.learn()
-            return False
+            return None
         self._to_measure = STRIDE
         if self._ref.end - self._drift.delay - STRIDE > self._onsets.current.end:
             return False
@@ -480,7 +490,7 @@ class Aligner:
 
     def _deliver(self, mic: Samples, before: float, switched: bool) -> Aligned:
         state, end, delay = self._state(), self._ref.end, self._drift.delay
-        if not (self._known or self._coarse):
+        if not self._located:
             nothing = self.history(self.hop)
             return Aligned(
                 nothing, math.nan, 0.0, 0.0, state, switched, self._at_any_lag(mic, nothing, state), self._wait
@@ -499,7 +509,7 @@ class Aligner:
         if begun and self._gain is not None and end - delay > self._open[0].start:
             brought = self._ref.read(end - round(delay) - self.hop, end - round(delay))
             heard = float(np.dot(mic, mic))  # is that 10 dB below the echo of the reference at that delay?
-            self._refuted = self._refuted or heard < 0.1 * self._gain * float(np.dot(brought, brought))
+            self._open[0].refuted |= heard < 0.1 * self._gain * float(np.dot(brought, brought))
         if self._refuted:
             reference = np.zeros(self.hop, np.float32)
         ppm, anywhere = -1e6 * self._drift.slope, self._at_any_lag(mic, reference, state)

@@ -41,7 +41,7 @@ class CoarseLag:
     >>> heard, lag = np.convolve(np.roll(voice, 4000), rng.standard_normal(400), "same"), CoarseLag(256, 16000)
     >>> for at in range(0, 48000, 256):
     ...     lag.step(heard[at : at + 256], voice[at : at + 256])
-    >>> abs(lag.find() - 4000) < 512
+    >>> abs(lag.find()[0] - 4000) < 512
     True
     """
 
@@ -81,14 +81,21 @@ class CoarseLag:
         self._power = self._forget * self._power + np.square(self._past).sum(axis=1)
         self._heard = self._forget * self._heard + float(heard @ heard)
 
-    def find(self) -> int | None:
-        """The lag in samples, None where none is beyond doubt: its correlation times the ratio to the best elsewhere is below 1."""
+    def find(self) -> tuple[int, float] | None:
+        """The lag and its standard deviation, samples; None where its correlation times the ratio to the best elsewhere is below 1.
+
+        Its neighbours are as likely as their correlation has it, of Gaussian shapes that are independent from hop to hop.
+        """
         score = self._cross / np.sqrt(self._power * self._heard + fourier.TINY)
         at = int(score.argmax())
         alike = self._alike / (self._alike[0] + fourier.TINY)
         left = score - score[at] * np.concatenate((alike[at:0:-1], alike[: score.size - at]))
-        elsewhere = max(
-            left[: max(at - SAME_HOPS, 0)].max(initial=CHANCE), left[at + SAME_HOPS + 1 :].max(initial=CHANCE)
-        )
-        heard = (self._frames - at) * self._hop >= ENOUGH_S * SAMPLE_RATE
-        return at * self._hop if heard and score[at] ** 2 > elsewhere else None
+        first, behind = max(at - SAME_HOPS, 0), at + SAME_HOPS + 1
+        elsewhere = max(left[:first].max(initial=CHANCE), left[behind:].max(initial=CHANCE))
+        heard, memory = (self._frames - at) * self._hop, MEMORY_S * SAMPLE_RATE
+        if heard < ENOUGH_S * SAMPLE_RATE or score[at] ** 2 <= elsewhere:
+            return None
+        unlike = 1.0 - np.square(np.minimum(score[first:behind], score[at]), dtype=float) + fourier.TINY
+        odds = (unlike[at - first] / unlike) ** (0.5 * min(heard, memory) / self._hop)
+        variance = 1 / 12 + float(odds @ np.square(np.arange(first, first + odds.size) - at)) / float(odds.sum())
+        return at * self._hop, self._hop * math.sqrt(variance)

@@ -132,7 +132,7 @@ class LagSearch:
     def listen(self, mics: Mapping[int, DelayBuffer], now: int, since: int) -> None:
         """Take the microphones up to now, but none of it before since; at most a window after `prepare`.
 
-        mics: by number, where the responses are known several, which `find` compares.
+        mics: by number, where the responses are known several, which `find` sums.
         """
         skipped = min(max(max(since, self._since) - (now - self._window), 0), self._window)
         self._at, self._start = now, self._size - self._window + skipped
@@ -145,16 +145,21 @@ class LagSearch:
                 self._crosses.append(self._whitened(x, self._reference, number))
 
     def find(self) -> Found | None:
-        """The best lag; None where there is nothing to compare, or less than MINIMUM of it would overlap.
+        """The likeliest lag; None where there is nothing to compare, or less than MINIMUM of it would overlap.
 
-        Several microphones: the first one's best lag, or the best lag of their second highest scores where that is clearer: a
-        lag that only one channel shows may be a loopback's.
+        Log likelihoods of a lag in noise of each microphone's own grow with its correlations, so these are summed. Of three or more, the
+        highest at a lag counts as the next one: a lag that only one channel shows may be a loopback's.
         """
         if not self._crosses:
             return None
-        scores = [self._scored(cross) for cross in self._crosses]
-        candidates = scores[:1] if len(scores) == 1 else [scores[0], np.sort(scores, axis=0)[-2]]
-        return max(filter(None, map(self._best, candidates)), key=lambda found: found.clearness, default=None)
+        scores = np.sort([self._scored(cross) for cross in self._crosses], axis=0)
+        if len(scores) > 2:
+            scores[-1] = scores[-2]
+        score = scores.sum(axis=0)
+        at = int(np.argmax(score))
+        lag = at - self._early
+        heard = self._at - self._since - max(lag, 0)
+        return Found(lag, _clearness(score, at), self._at, heard) if heard >= MINIMUM and score[at] > 0.0 else None
 
     def _scored(self, cross: np.ndarray) -> Samples:
         """The correlation (lags,) over what a lag lets overlap, and over its own root mean square."""
@@ -167,15 +172,6 @@ class LagSearch:
         score *= np.repeat(1.0 / np.sqrt(overlap + 0.1 * overlap.max() + 1e-30), SAME)[: self._lags]
         score /= np.sqrt(np.dot(score, score) + 1e-30)
         return score
-
-    def _best(self, score: Samples) -> Found | None:
-        """The lag of the highest peak."""
-        at = int(np.argmax(score))
-        lag = at - self._early
-        heard = self._at - self._since - max(lag, 0)
-        if heard < MINIMUM or score[at] <= 0.0:
-            return None
-        return Found(lag, _clearness(score, at), self._at, heard)
 
     def before(self, number: int, mic: DelayBuffer, ref: DelayBuffer | Playback, found: Found) -> Found:
         """The lag with its odds after a look back at the microphone's window BETWEEN samples before, and with that window's end.

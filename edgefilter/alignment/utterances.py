@@ -50,7 +50,7 @@ class Utterance:
 
     after: end of the one before it, which the microphone hears out first, since one loudspeaker plays them in turn.
     lost: whether it is one that was followed and is looked for again, not one that began; nearby: searches left that
-    suppose it to have jumped a short while ago, its start moving along.
+    suppose it to have jumped a short while ago, its start moving along. refuted: whether it is not heard at the lag of before.
     """
 
     start: int
@@ -58,6 +58,7 @@ class Utterance:
     after: int = NEVER
     nearby: int = 0
     lost: bool = False
+    refuted: bool = False
 
 
 class Sustained:
