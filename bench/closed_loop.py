@@ -65,4 +65,4 @@ def recorded(mic: Samples, ref: Samples, ask_db: float) -> Robot | None:
     ego.process(mic, ref)
     found = ego.stats()["alignment"]
     late, wide = (found["delay_samples"], found["deviation_samples"]) if found else (None, None)
-    return None if late is None or wide > PRE_ROLL else Robot(mic, round(late), ask_db)
+    return None if late is None or wide is None or wide > PRE_ROLL else Robot(mic, round(late), ask_db)
