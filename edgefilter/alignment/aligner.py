@@ -225,7 +225,15 @@ class Aligner:
 
     def _certain(self, found: Found) -> bool:
         """Whether a search is to be believed, also against a lag that is certain but not followed."""
-        return found.odds > CERTAIN * (CERTAIN if self._displaced else 1.0)
+        return self._odds(found) > CERTAIN * (CERTAIN if self._displaced else 1.0)
+
+    def _odds(self, found: Found) -> float:
+        """The odds of a lag that a search found: of an utterance that begins at another lag than is followed, robots repeat one of before."""
+        if not self._open or self._open[0].lost or not abs(found.lag - self._drift.delay) > SAME:
+            return found.odds
+        followed = (look for look in self._looks if not look.heard and look.odds > CERTAIN)
+        now = [round(look.lag + self._drift.slope * (found.at - look.at)) for look in followed]
+        return found.odds / (ALIKE if any(abs(lag - found.lag) <= SAME for lag in now) else 1.0)
 
     @property
     def _located(self) -> bool:
@@ -392,7 +400,7 @@ class Aligner:
 
     def _take(self, found: Found) -> bool:
         """Accept this lag as the robot's; return whether the delay of the reference has changed."""
-        self._log_odds = min(math.log(found.odds), SUREST)
+        self._log_odds = min(math.log(self._odds(found)), SUREST)
         if self._expected is not None:
             return self._begin(self._expected.start + found.lag)
         was_refuted = self._refuted
