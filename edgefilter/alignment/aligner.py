@@ -157,12 +157,7 @@ class Aligner:
             self._meter = self._new_meter()
 
     def announce(self, utterance: Samples) -> bool:
-        """Say what will be played (n,); it may begin at any time or never, and several are played in the order of announcing.
-
-        A sound in the reference channel is the reference, and drops announcements. While there is none, the announced
-        utterance is looked for in the microphone for 30 s, and from where it is heard on it is the reference.
-        False where too many wait already: then it is not announced.
-        """
+        """Say what will be played (n,), at any time or never: `Announcements`. False where too many wait already: then it is not announced."""
         kept = self._announced.add(utterance)
         self._counts["announced"] += kept
         return kept
@@ -236,19 +231,18 @@ class Aligner:
         return found.odds / (ALIKE if any(abs(lag - found.lag) <= SAME for lag in now) else 1.0)
 
     @property
-    def _located(self) -> bool:
-        """Whether a lag is followed, sharp or coarse."""
-        return self._drift.shared < math.inf
-
-    @property
     def _known(self) -> bool:
         """Whether the lag that is followed is that of a sharp arrival."""
         return self._drift.shared == 0.0
 
     @property
+    def _located(self) -> bool:
+        """Whether a lag is followed, sharp or coarse."""
+        return self._drift.shared < math.inf
+
+    @property
     def _coarse(self) -> bool:
-        """Whether a lag is followed at which nothing sharp arrives."""
-        return 0.0 < self._drift.shared < math.inf
+        return self._located and not self._known
 
     @property
     def _refuted(self) -> bool:
@@ -377,11 +371,10 @@ class Aligner:
         ref = self._expected or self._ref
         self._lags.prepare(ref, now, self._expected.start if self._expected else self._open[0].start)
         yield False
-        heard_out = (
-            self._open[0].after + int(self._drift.delay) if self._open and self._known and self._log_odds > 0.0 else 0
-        )
+        sure = self._known and self._log_odds > 0.0
+        before = self._open[0].after + int(self._drift.delay) if self._open and sure else 0
         together = self._used if self._responses is not None else self._used[:1]
-        self._lags.listen({at: self._mics[at] for at in together}, self._ref.end, heard_out)
+        self._lags.listen({at: self._mics[at] for at in together}, self._ref.end, before)
         yield False
         found, looked_back = self._lags.find(), False
         while found is not None:
@@ -401,8 +394,12 @@ class Aligner:
     def _take(self, found: Found) -> bool:
         """Accept this lag as the robot's; return whether the delay of the reference has changed."""
         self._log_odds = min(math.log(self._odds(found)), SUREST)
-        if self._expected is not None:
-            return self._begin(self._expected.start + found.lag)
+        if self._expected is not None:  # heard: from now on it is the reference
+            playback, now = self._announced.begin(self._expected.start + found.lag), self._ref.end
+            self._counts["announced_heard"] += 1
+            self._ref.rewrite(playback.start, playback.read(playback.start, now))
+            self._onsets.current = Utterance(playback.start, now)
+            return self._switch(float(AHEAD))
         was_refuted = self._refuted
         self._resolve()
         if not self._known or abs(found.lag - self._drift.delay) > SAME:
@@ -412,14 +409,6 @@ class Aligner:
             drift, now = self._drift, self._ref.end
             self._meter.study(self._mics[self._used[0]], self._ref, now - WINDOW, now, drift.delay, drift.slope)
         return was_refuted
-
-    def _begin(self, heard_at: int) -> bool:
-        """What was announced is heard since heard_at: from now on it is the reference."""
-        playback, now = self._announced.begin(heard_at), self._ref.end
-        self._counts["announced_heard"] += 1
-        self._ref.rewrite(playback.start, playback.read(playback.start, now))
-        self._onsets.current = Utterance(playback.start, now)
-        return self._switch(float(AHEAD))
 
     def _switch(self, delay: float) -> bool:
         if self._coarse and not math.isnan(self._read_at):  # the canceller has learned what arrives behind that lag
@@ -497,31 +486,27 @@ class Aligner:
             self._open.append(Utterance(self._onsets.current.start, self._onsets.current.end, lost=True))
 
     def _deliver(self, mic: Samples, before: float, switched: bool) -> Aligned:
-        state, end, delay = self._state(), self._ref.end, self._drift.delay
-        if not self._located:
-            nothing = self.history(self.hop)
-            return Aligned(
-                nothing, math.nan, 0.0, 0.0, state, switched, self._at_any_lag(mic, nothing, state), self._wait
-            )
-        if not HALF_WIDTH // 2 < delay + self._wait < PRE_ROLL:
-            self._wait = min(max(HALF_WIDTH - round(delay), 0), WAIT)
-        self._read_at = max(delay + self._wait - self._margin, 0.0)
-        start = self._read_at - self._drift.slope * self.hop if switched else before
-        if self._read_at < HALF_WIDTH:
-            start = self._read_at = float(round(self._read_at))
-        if abs(start - self._read_at) > 0.5:
-            start, switched = self._read_at - self._drift.slope * self.hop, True
-        reference = read_delayed(self._ref, end, self.hop, start, self._read_at)
-        # one that is lost may only have moved away, and be softer there, unless samples are missing: then its lag has grown again
-        begun = self._known and self._open and (not self._open[0].lost or self._belief.lost)
-        if begun and self._gain is not None and end - delay > self._open[0].start:
-            brought = self._ref.read(end - round(delay) - self.hop, end - round(delay))
-            heard = float(np.dot(mic, mic))  # is that 10 dB below the echo of the reference at that delay?
-            self._open[0].refuted |= heard < 0.1 * self._gain * float(np.dot(brought, brought))
-        if self._refuted:
-            reference = np.zeros(self.hop, np.float32)
-        ppm, anywhere = -1e6 * self._drift.slope, self._at_any_lag(mic, reference, state)
-        return Aligned(reference, delay, ppm, self._probability, state, switched, anywhere, self._wait)
+        state, end, delay, slope = self._state(), self._ref.end, self._drift.delay, self._drift.slope
+        reference = np.zeros(self.hop, np.float32)
+        if self._located:
+            if not HALF_WIDTH // 2 < delay + self._wait < PRE_ROLL:
+                self._wait = min(max(HALF_WIDTH - round(delay), 0), WAIT)
+            self._read_at = max(delay + self._wait - self._margin, 0.0)
+            start = self._read_at - slope * self.hop if switched else before
+            if self._read_at < HALF_WIDTH:
+                start = self._read_at = float(round(self._read_at))
+            if abs(start - self._read_at) > 0.5:
+                start, switched = self._read_at - slope * self.hop, True
+            # one that is lost may only have moved away, and be softer there, unless samples are missing: then its lag has grown again
+            begun = self._known and self._open and (not self._open[0].lost or self._belief.lost)
+            if begun and self._gain is not None and end - delay > self._open[0].start:
+                brought = self._ref.read(end - round(delay) - self.hop, end - round(delay))
+                heard = float(np.dot(mic, mic))  # is that 10 dB below the echo of the reference at that delay?
+                self._open[0].refuted |= heard < 0.1 * self._gain * float(np.dot(brought, brought))
+            if not self._refuted:
+                reference = read_delayed(self._ref, end, self.hop, start, self._read_at)
+        anywhere = self._at_any_lag(mic, reference, state)
+        return Aligned(reference, delay, -1e6 * slope, self._probability, state, switched, anywhere, self._wait)
 
     def _at_any_lag(self, mic: Samples, reference: Samples, state: AlignmentState) -> bool:
         """What `Aligned` says of it, for a hop of the microphone and the reference at the delay of before.

@@ -56,8 +56,7 @@ class CoarseLag:
         self._means = np.zeros((2, self._edges.size), np.float32)
         self._past = np.zeros((lags, self._edges.size), np.float32)
         self._cross, self._power, self._alike = np.zeros((3, lags))
-        self._heard = 0.0
-        self._frames = 0
+        self._heard, self._frames = 0.0, 0
 
     def step(self, mic: Samples, ref: Samples) -> None:
         """Take in a hop (hop,) of both."""
@@ -82,20 +81,16 @@ class CoarseLag:
         self._heard = self._forget * self._heard + float(heard @ heard)
 
     def find(self) -> tuple[int, float] | None:
-        """The lag and its standard deviation, samples; None where its correlation times the ratio to the best elsewhere is below 1.
-
-        Its neighbours are as likely as their correlation has it, of Gaussian shapes that are independent from hop to hop.
-        """
+        """The lag and its standard deviation, samples; None where its correlation times the ratio to the best elsewhere is below 1."""
         score = self._cross / np.sqrt(self._power * self._heard + fourier.TINY)
         at = int(score.argmax())
         alike = self._alike / (self._alike[0] + fourier.TINY)
         left = score - score[at] * np.concatenate((alike[at:0:-1], alike[: score.size - at]))
-        first, behind = max(at - SAME_HOPS, 0), at + SAME_HOPS + 1
-        elsewhere = max(left[:first].max(initial=CHANCE), left[behind:].max(initial=CHANCE))
-        heard, memory = (self._frames - at) * self._hop, MEMORY_S * SAMPLE_RATE
-        if heard < ENOUGH_S * SAMPLE_RATE or score[at] ** 2 <= elsewhere:
+        near = np.arange(max(at - SAME_HOPS, 0), min(at + SAME_HOPS + 1, score.size))
+        heard = (self._frames - at) * self._hop / SAMPLE_RATE
+        if heard < ENOUGH_S or score[at] ** 2 <= np.delete(left, near).max(initial=CHANCE):
             return None
-        unlike = 1.0 - np.square(np.minimum(score[first:behind], score[at]), dtype=float) + fourier.TINY
-        odds = (unlike[at - first] / unlike) ** (0.5 * min(heard, memory) / self._hop)
-        variance = 1 / 12 + float(odds @ np.square(np.arange(first, first + odds.size) - at)) / float(odds.sum())
-        return at * self._hop, self._hop * math.sqrt(variance)
+        # of Gaussian shapes that are independent from hop to hop, the likelihood of its neighbours
+        unlike = np.maximum(1.0 - np.square(score[near]), fourier.TINY)
+        odds = (unlike.min() / unlike) ** (0.5 * min(heard, MEMORY_S) * SAMPLE_RATE / self._hop)
+        return at * self._hop, self._hop * math.sqrt(1 / 12 + np.average((near - at) ** 2, weights=odds))

@@ -21,8 +21,7 @@ class DelayBuffer:
 
     def __init__(self, capacity: int) -> None:
         self._data = np.zeros(2 * capacity, np.float32)
-        self.capacity = capacity
-        self._at = capacity
+        self.capacity = self._at = capacity
         self.end = 0
 
     def push(self, samples: Samples) -> None:

@@ -243,9 +243,9 @@ class DriftFilter:
         return math.hypot(math.sqrt(self._variance), self.shared)
 
     def restart(self, delay: float, deviation: float = SMALL / EXPECTED, shared: float = 0.0) -> None:
-        """Another delay, known to +-deviation samples; the slope stays, the clocks are the same. A search finds it to within SMALL.
+        """Another delay, known to +-deviation samples, beside what all looks err alike (shared), so that none corrects it.
 
-        shared: standard deviation of what all looks err alike, so that none corrects it: what they see is where the sound was expected.
+        The slope stays, the clocks are the same. A search finds it to within SMALL.
         """
         self.delay, self.shared = delay, shared
         self._variance, self._covariance = deviation**2, 0.0

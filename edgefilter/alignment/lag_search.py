@@ -43,7 +43,7 @@ talk all the time, a wrong one in an hour."""
 ALIKE = 0.05
 """Probability that all looks share one error: a reflection taken for the direct sound, a path without a sharp peak, a path that was
 calibrated elsewhere. However many there are, looks raise the odds by 1/ALIKE at most: where that may be so one earlier look
-is taken, and only for a lag with odds of CERTAIN * ALIKE or more."""
+is taken, and only for a lag with odds of CERTAIN * ALIKE or more. That a lag was followed before raises them by as much."""
 MISSED = 0.3
 """Probability that a second with audible robot has no peak at its lag: .21 of the seconds in 19 real recordings had none."""
 
@@ -130,10 +130,7 @@ class LagSearch:
         self._prepared, self._since = now, since
 
     def listen(self, mics: Mapping[int, DelayBuffer], now: int, since: int) -> None:
-        """Take the microphones up to now, but none of it before since; at most a window after `prepare`.
-
-        mics: by number, where the responses are known several, which `find` sums.
-        """
+        """Take the microphones by their number, several where the responses are known, from since up to now; at most a window after `prepare`."""
         skipped = min(max(max(since, self._since) - (now - self._window), 0), self._window)
         self._at, self._start = now, self._size - self._window + skipped
         self._crosses = []
@@ -152,7 +149,13 @@ class LagSearch:
         """
         if not self._crosses:
             return None
-        scores = np.sort([self._scored(cross) for cross in self._crosses], axis=0)
+        # the energy of the reference, first difference, that falls under the microphone's window, at every SAME-th lag
+        late = self._at - self._prepared
+        lags, last = np.arange(0, self._lags, SAME) - self._early, self._total.size - 1
+        upper, lower = (np.clip((end + late - lags) // SAME, 0, last) for end in (self._size, self._start))
+        overlap = (self._total[upper] - self._total[lower]).astype(np.float32)
+        weight = np.repeat(1.0 / np.sqrt(overlap + 0.1 * overlap.max() + 1e-30), SAME)[: self._lags]
+        scores = np.sort([self._scored(cross, late + self._early, weight) for cross in self._crosses], axis=0)
         if len(scores) > 2:
             scores[-1] = scores[-2]
         score = scores.sum(axis=0)
@@ -161,15 +164,13 @@ class LagSearch:
         heard = self._at - self._since - max(lag, 0)
         return Found(lag, _clearness(score, at), self._at, heard) if heard >= MINIMUM and score[at] > 0.0 else None
 
-    def _scored(self, cross: np.ndarray) -> Samples:
-        """The correlation (lags,) over what a lag lets overlap, and over its own root mean square."""
-        late = self._at - self._prepared
-        overlap, before = self._overlap(late), late + self._early
+    def _scored(self, cross: np.ndarray, before: int, weight: Samples) -> Samples:
+        """The correlation from `before` lags before 0 on, weighted (lags,) by what a lag lets overlap, over its own root mean square."""
         correlation = fft.irfft(cross, self._size)
         score = np.concatenate((correlation[self._size - before :], correlation[: self._lags - before]))
         if not self._signed:
             np.abs(score, out=score)
-        score *= np.repeat(1.0 / np.sqrt(overlap + 0.1 * overlap.max() + 1e-30), SAME)[: self._lags]
+        score *= weight
         score /= np.sqrt(np.dot(score, score) + 1e-30)
         return score
 
@@ -200,14 +201,6 @@ class LagSearch:
         if self._signed:
             cross *= self._phases[heard.size][number]
         return cross
-
-    def _overlap(self, late: int) -> Samples:
-        """Energy of the reference, first difference, that falls under the microphone's window, at every SAME-th lag."""
-        last = self._total.size - 1
-        lags = np.arange(0, self._lags, SAME) - self._early
-        upper = np.clip((self._size + late - lags) // SAME, 0, last)
-        lower = np.clip((self._start + late - lags) // SAME, 0, last)
-        return (self._total[upper] - self._total[lower]).astype(np.float32)
 
 
 def _clearness(score: Samples, at: int) -> float:

@@ -136,7 +136,8 @@ class Playback:
 class Announcements:
     """Utterances that the robot said it would play, in this order, for a reference channel that stays silent.
 
-    A channel that carries sound is believed instead: then all of them are dropped.
+    Each is looked for in the microphone for PATIENCE, and from where it is heard on it is the reference. A channel that carries
+    sound is believed instead: then all of them are dropped.
     """
 
     def __init__(self) -> None:
