@@ -290,9 +290,8 @@ def test_an_utterance_at_a_lag_of_before_is_found_soon_beside_a_human_as_loud(se
     human = speech_like(rng, mic.size / RATE)[: mic.size]
     mic = mic + human * np.std(mic) / np.std(human) + fan(rng, mic.size)
     hops = run(Aligner(256), mic.astype(np.float32), ref)
-    assert (
-        time_to_align(hops, truth, onsets[2] + 4000 + HEAD, 256) < 0.15 * RATE
-    )  # the first takes up to .27 s without the memory
+    taken = time_to_align(hops, truth, onsets[2] + 4000 + HEAD, 256)
+    assert taken < 0.22 * RATE  # one of the four takes .27 s without the memory
 
 
 @pytest.mark.parametrize("seed", range(4))
