@@ -253,11 +253,14 @@ class Aligner:
         """Find where the reference is to be read as long as nothing sharper is known; True if that is elsewhere than before."""
         by_bands.step(mic, ref)
         found = by_bands.find()
-        if found is None or (self._coarse and abs(found[0] - self._drift.delay) <= COARSE_MARGIN):
+        if found is None:
             return False
-        self._meter, self._margin = DelayMeter(), COARSE_MARGIN
-        self._drift.restart(float(found[0]), shared=found[1])
-        return True
+        moved = not self._coarse or abs(found[0] - self._drift.delay) > COARSE_MARGIN
+        if moved:
+            self._meter, self._margin = DelayMeter(), COARSE_MARGIN
+            self._drift.restart(float(found[0]))
+        self._drift.shared = found[1]
+        return moved
 
     def history(self, count: int) -> Samples:
         """The last count aligned samples (count,) float32, the present hop included, as if the present delay had always held."""

@@ -235,19 +235,19 @@ class DriftFilter:
     def __init__(self) -> None:
         self.slope, self._slope_variance = 0.0, SLOPE_DEVIATION**2
         self._witness = JumpWitness()
-        self.restart(float("nan"), shared=float("inf"))  # nothing is known of a delay
+        self.restart(float("nan"))
+        self.shared = float(
+            "inf"
+        )  # standard deviation of what all looks err alike, so that none corrects it: no delay is known
 
     @property
     def deviation(self) -> float:
-        """Standard deviation of the delay, samples."""
+        """Standard deviation of the delay, samples, with what all looks err alike (shared), so that none corrects it."""
         return math.hypot(math.sqrt(self._variance), self.shared)
 
-    def restart(self, delay: float, deviation: float = SMALL / EXPECTED, shared: float = 0.0) -> None:
-        """Another delay, known to +-deviation samples, beside what all looks err alike (shared), so that none corrects it.
-
-        The slope stays, the clocks are the same. A search finds it to within SMALL.
-        """
-        self.delay, self.shared = delay, shared
+    def restart(self, delay: float, deviation: float = SMALL / EXPECTED) -> None:
+        """Another delay, known to +-deviation samples; the slope stays, the clocks are the same. A search finds it to within SMALL."""
+        self.delay, self.shared = delay, 0.0
         self._variance, self._covariance = deviation**2, 0.0
         self._since = 0
         self._witness.forget()
