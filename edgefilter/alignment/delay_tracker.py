@@ -236,9 +236,7 @@ class DriftFilter:
         self.slope, self._slope_variance = 0.0, SLOPE_DEVIATION**2
         self._witness = JumpWitness()
         self.restart(float("nan"))
-        self.shared = float(
-            "inf"
-        )  # standard deviation of what all looks err alike, so that none corrects it: no delay is known
+        self.shared = float("inf")  # no delay is known
 
     @property
     def deviation(self) -> float:
