@@ -60,10 +60,19 @@ class Frame(NamedTuple):
 
 
 class Output(NamedTuple):
-    """An engine's answer: the human's spectrum (bins,) complex64 and, if it judges that, whether a human speaks (0-1)."""
+    """An engine's answer: the human's spectrum (bins,) complex64 and, if it judges that, whether a human speaks (0-1).
+
+    recognise: spectrum of the sound for a recogniser; None where that is the same.
+    """
 
     spectrum: Spectrum
     speech_probability: float | None = None
+    recognise: Spectrum | None = None
+
+    @property
+    def sounds(self) -> Spectrum:
+        """Spectra (2, bins): to recognise, to listen to."""
+        return np.stack((self.spectrum if self.recognise is None else self.recognise, self.spectrum))
 
 
 _Speech: TypeAlias = Literal["speech_suspected", "speech_dismissed", "speech_started", "speech_stopped", "voice_gain"]

@@ -52,10 +52,10 @@ class EdgeGraph(nn.Module):
         for layer, state in zip(self.memory, hidden.split(1)):
             heard = layer(heard, state)
             following.append(heard)
-        raw = nn.functional.pad(network.decode(heard, met, skips).squeeze(2), (1, 0)).permute(0, 2, 1)
-        human = corrected(wiener.gain(ratio), raw, error)
+        raw = nn.functional.pad(network.decode(heard, met, skips).squeeze(2), (1, 0)).reshape(2, 2, -1).permute(0, 2, 1)
+        listen, recognise = corrected(wiener.gain(ratio), raw, error).split(1)
         speech = torch.sigmoid(network.speech(heard)).reshape(1)
-        return human, speech, mic_now, ref_now, answered, torch.cat(following)
+        return listen, recognise, speech, mic_now, ref_now, answered, torch.cat(following)
 
 
 class OperatorLayer(nn.Module):

@@ -13,7 +13,7 @@ EPSILON = 1e-8
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Weights of the terms of edge_loss.
+    """Weights of the terms of sound_loss, and of the speech head's.
 
     suppression: an amplitude too small costs 1 + suppression / magnitude times as much as one that is too large, since
     words that were deleted do not come back, while a recogniser gets over some of the robot.
@@ -43,22 +43,13 @@ def power_law_loss(mask: Tensor, mixture: Tensor, clean: Tensor, exponent: float
     return ((mask * mixture + EPSILON) ** exponent - (clean + EPSILON) ** exponent).square().mean()
 
 
-def edge_loss(
-    human: Tensor,
-    logit: Tensor,
-    clean: Tensor,
-    wanted: Tensor,
-    active: Tensor,
-    weights: LossWeights,
-    heed: Tensor | None = None,
-) -> dict[str, Tensor]:
-    """Terms and their weighted "total".
+def sound_loss(human: Tensor, clean: Tensor, wanted: Tensor, weights: LossWeights) -> dict[str, Tensor]:
+    """Terms of one of the network's sounds and their weighted "total".
 
     human, clean, wanted: (batch, frames, bins, 2), scaled so that speech is near 1; wanted is the human with as much of
-    the fan as the estimate should keep. logit, active, heed: (batch, frames); heed is what each frame counts for the head,
-    None for all the same. suppression counts once more where the estimate is below what is wanted: words that are gone
-    do not come back (Braun & Tashev 2020 compress likewise; the asymmetry follows Wang et al. 2020, "VoiceFilter-Lite",
-    eq. (2)).
+    the fan as the estimate should keep. suppression counts once more where the estimate is below what is wanted: words
+    that are gone do not come back (Braun & Tashev 2020 compress likewise; the asymmetry follows Wang et al. 2020,
+    "VoiceFilter-Lite", eq. (2)).
     """
     magnitude, phased = compressed(human, weights.compression)
     target, target_phased = compressed(wanted, weights.compression)
@@ -68,10 +59,14 @@ def edge_loss(
         "magnitude": (magnitude - target).square().mean(),
         "suppression": missing.square().mean(),
         "si_sdr": -si_sdr(human, clean),
-        "speech": binary_cross_entropy_with_logits(logit, active, None if heed is None else heed / heed.mean()),
     }
     terms["total"] = sum(getattr(weights, name) * value for name, value in terms.items())
     return terms
+
+
+def speech_loss(logit: Tensor, active: Tensor, heed: Tensor | None = None) -> Tensor:
+    """Cross-entropy of the speech head; logit, active, heed: (batch, frames); heed: what each frame counts, None for all the same."""
+    return binary_cross_entropy_with_logits(logit, active, None if heed is None else heed / heed.mean())
 
 
 def si_sdr(human: Tensor, clean: Tensor) -> Tensor:

@@ -111,7 +111,10 @@ class Upward(nn.Module):
 
 
 class EdgeCrnn(nn.Module):
-    """Spectra of error, mic, reference, echo, powers of noise and residual to the human's spectrum and the probability of speech.
+    """Spectra of error, mic, reference, echo, powers of noise and residual to two spectra of the human and the probability of speech.
+
+    The first spectrum is to listen to, the second for a recogniser, which minds a fan less than gaps in a voice: a head of two
+    convolutions corrects the first one's mask.
 
     The state is the previous frame's features of either branch (batch, 6, bands), the power of the prior's previous answer
     (batch, bins) and the GRU's (layers, batch, hidden).
@@ -135,9 +138,13 @@ class EdgeCrnn(nn.Module):
         self.up_4, self.up_3 = Upward(2 * c4, c3, f // 16, norm), Upward(2 * c3, c2, f // 8, norm)
         self.up_2, self.up_1 = Upward(3 * c2, c1, f // 4, norm), Upward(3 * c1, c1, f // 2, norm)
         self.mask = nn.Conv2d(c1, 2, (1, 3), padding=(0, 1))
+        self.recognise = nn.Sequential(
+            nn.Conv2d(c1, c1, (1, 3), padding=(0, 1)), nn.LeakyReLU(0.1), nn.Conv2d(c1, 2, (1, 3), padding=(0, 1))
+        )
         self.speech = nn.Linear(config.hidden, 1)
-        nn.init.zeros_(self.mask.weight)
-        nn.init.zeros_(self.mask.bias)
+        for last in (self.mask, self.recognise[-1]):
+            nn.init.zeros_(last.weight)
+            nn.init.zeros_(last.bias)
 
     def initial_state(self, batch: int = 1) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """All zeros: before the first frame there was silence."""
@@ -158,8 +165,8 @@ class EdgeCrnn(nn.Module):
         noise: Tensor,
         residual: Tensor,
         state: tuple[Tensor, ...],
-    ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-        """The human's spectra, logits (batch, frames) and the next state, of spectra (batch, frames, bins, 2) and powers (batch, frames, bins)."""
+    ) -> tuple[Tensor, Tensor, Tensor, tuple[Tensor, ...]]:
+        """Both spectra, logits (batch, frames) and the next state, of spectra (batch, frames, bins, 2) and powers (batch, frames, bins)."""
         batch, frames = error.shape[:2]
         mic_x, mic_last = _with_previous(torch.cat((features(error), features(mic)), -1), state[0])
         ref_x, ref_last = _with_previous(torch.cat((features(reference), features(echo)), -1), state[1])
@@ -170,9 +177,11 @@ class EdgeCrnn(nn.Module):
         mic_x = torch.cat((mic_x, expected), -1)
         met, skips = self.encode(_channels_last(mic_x), _channels_last(ref_x))
         remembered, hidden = self.memory(torch.relu(self.inward(met.reshape(batch, frames, -1))), state[3])
-        raw = self.decode(remembered, met, skips).permute(0, 2, 3, 1).reshape(batch, frames, self.config.bands, 2)
-        human = corrected(wiener.gain(ratio), nn.functional.pad(raw.float(), (0, 0, 1, 0)), error)
-        return human, self.speech(remembered).squeeze(-1), (mic_last, ref_last, answered, hidden)
+        raw = self.decode(remembered, met, skips).permute(0, 2, 3, 1).reshape(batch, frames, self.config.bands, 4)
+        listen, recognise = nn.functional.pad(raw.float(), (0, 0, 1, 0)).split(2, -1)
+        gain = wiener.gain(ratio)
+        sounds = corrected(gain, listen, error), corrected(gain, recognise, error)
+        return *sounds, self.speech(remembered).squeeze(-1), (mic_last, ref_last, answered, hidden)
 
     def encode(self, mic: Tensor, reference: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
         """Features of either branch, (n, 15 and 12, 1, bands), to where both meet, and the skips to the decoder."""
@@ -184,14 +193,16 @@ class EdgeCrnn(nn.Module):
         return self.joint_2(j1), (m1, r1, m2, r2, j1)
 
     def decode(self, remembered: Tensor, met: Tensor, skips: tuple[Tensor, ...]) -> Tensor:
-        """The GRU's output with what `encode` gave to the raw correction (n, 2, 1, bands)."""
+        """The GRU's output with what `encode` gave to the raw corrections (n, 4, 1, bands): two of each sound."""
         m1, r1, m2, r2, j1 = skips
         y = torch.relu(self.outward(remembered)).reshape(met.shape)
         if not met.is_contiguous():
             y = y.contiguous(memory_format=torch.channels_last)
         y = self.up_3(torch.cat((self.up_4(torch.cat((y, met), 1)), j1), 1))
         y = self.up_1(torch.cat((self.up_2(torch.cat((y, m2, r2), 1)), m1, r1), 1))
-        return _on_bands(self.mask(y), self.spreading) if self.config.erb else self.mask(y)
+        listen = self.mask(y)
+        raw = torch.cat((listen, listen + self.recognise(y)), 1)
+        return _on_bands(raw, self.spreading) if self.config.erb else raw
 
     def step(
         self,
@@ -202,11 +213,11 @@ class EdgeCrnn(nn.Module):
         noise: Tensor,
         residual: Tensor,
         state: tuple[Tensor, ...],
-    ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-        """One frame, spectra (1, bins, 2) and powers (1, bins): the human's spectrum, the probability (1,) of speech, the next state."""
+    ) -> tuple[Tensor, Tensor, Tensor, tuple[Tensor, ...]]:
+        """One frame, spectra (1, bins, 2) and powers (1, bins): both spectra, the probability (1,) of speech, the next state."""
         frame = (x.unsqueeze(1) for x in (error, mic, reference, echo, noise, residual))
-        human, logit, state = self(*frame, state)
-        return human.squeeze(1), torch.sigmoid(logit.squeeze(1)), state
+        listen, recognise, logit, state = self(*frame, state)
+        return listen.squeeze(1), recognise.squeeze(1), torch.sigmoid(logit.squeeze(1)), state
 
 
 def erb_rate(frequency_hz: np.ndarray) -> np.ndarray:

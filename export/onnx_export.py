@@ -30,7 +30,7 @@ import torch
 from torch import Tensor, nn
 
 from edgefilter.dsp.stft import StftConfig
-from edgefilter.engines.crnn import EDGE_TYPE, EDGE_VERSION, POWERS, SPECTRA
+from edgefilter.engines.crnn import EDGE_TYPE, EDGE_VERSION, POWERS, SOUNDS, SPECTRA
 from edgefilter.engines.paper_crnn import PAPER_TYPE, PAPER_VERSION
 from edgefilter.engines.paper_ss import PAPER_STFT
 from edgefilter.errors import EdgefilterError, ModelError
@@ -65,7 +65,9 @@ def load(path: Path) -> Trained:
             "voicefilter": lambda c: VoiceFilter(VoiceFilterConfig(**c)),
         }[found.get("kind", "edge")]
         network = make(found["config"])
-        network.load_state_dict(found["network"])
+        # trained before there was a second sound: it is the first
+        second = {name: value for name, value in network.state_dict().items() if name.startswith("recognise.")}
+        network.load_state_dict(second | found["network"])
     except OSError as error:
         raise ModelError(f"{path}: {error.strerror}; give a checkpoint that training wrote") from None
     except Exception as error:
@@ -139,7 +141,7 @@ def _write_edge(trained: Trained, path: Path, products: bool = False) -> None:
         inputs,
         path,
         [*SPECTRA, *POWERS, *names],
-        ["spectrum", "speech_probability", *(f"next_{name}" for name in names)],
+        [*SOUNDS, "speech_probability", *(f"next_{name}" for name in names)],
     )
     states = [[name, list(tensor.shape)] for name, tensor in zip(names, state)]
     describe(path, EDGE_TYPE, EDGE_VERSION, stft, trained, states=json.dumps(states))

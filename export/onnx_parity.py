@@ -96,21 +96,21 @@ def _edge_ratio_db(network: nn.Module, path: Path, frames: int) -> float:
 
 @torch.no_grad()
 def _chained(network: nn.Module, path: Path, frames: int) -> Iterator[tuple[list[np.ndarray], list[np.ndarray]]]:
-    """Spectrum, probability and states of network and file, frame after frame, each going on from its own states."""
+    """Both spectra, probability and states of network and file, frame after frame, each going on from its own states."""
     session = open_session(path)
     rng = np.random.default_rng(0)
     state = network.initial_state()
     for _ in range(WARM_UP):
-        _, _, state = network.step(*_frame(network, rng), state)
+        *_, state = network.step(*_frame(network, rng), state)
     if not any(tensor.any() for tensor in state):
         raise ModelError("the network's state stays zero: a parity test from there proves nothing")
     theirs = [tensor.numpy() for tensor in state]
     for _ in range(frames):
         spectra = _frame(network, rng)
-        spectrum, probability, state = network.step(*spectra, state)
+        *found, state = network.step(*spectra, state)
         answers = session.run(None, _named(session, [*spectra, *theirs]))
-        theirs = answers[2:]
-        yield [tensor.numpy() for tensor in (spectrum, probability, *state)], answers
+        theirs = answers[len(found) :]
+        yield [tensor.numpy() for tensor in (*found, *state)], answers
 
 
 def _frame(network: nn.Module, rng: np.random.Generator) -> list[Tensor]:

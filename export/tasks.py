@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.paper_ss import PAPER_STFT
 from edgefilter.errors import UsageError
-from export.losses import LossWeights, edge_loss, power_law_loss, si_sdr
+from export.losses import LossWeights, power_law_loss, si_sdr, sound_loss, speech_loss
 from export.network import EdgeConfig, EdgeCrnn, count
 from export.paper_network import DILATIONS, PaperConfig, PaperCrnn, parameter_count
 from export.recogniser_loss import RecogniserLoss
@@ -71,12 +71,17 @@ class EdgeTask:
         self.weights = LossWeights(suppression=options.suppression, si_sdr=options.si_sdr)
         self.stft, self.half = self._config.stft, not options.full_precision
         self.recogniser = RecogniserLoss(options.recogniser, self.stft, half=self.half) if options.recogniser else None
-        if not 0.0 <= options.fan_kept <= 1.0:
-            raise UsageError(f"--fan-kept is {options.fan_kept:g}, expected 0 to 1")
-        self.recogniser_weight, self.fan_kept = options.recogniser_weight, options.fan_kept
+        for name, share in (("--fan-kept", options.fan_kept), ("--fan-recognised", options.fan_recognised)):
+            if not 0.0 <= share <= 1.0:
+                raise UsageError(f"{name} is {share:g}, expected 0 to 1")
+        self.fans_kept = options.fan_kept, options.fan_recognised
+        self.recogniser_weight, self.heads = options.recogniser_weight, options.heads
 
     def network(self) -> EdgeCrnn:
-        return EdgeCrnn(self._config).to(memory_format=torch.channels_last)
+        network = EdgeCrnn(self._config).to(memory_format=torch.channels_last)
+        for name, weight in network.named_parameters():
+            weight.requires_grad_(not self.heads or name.startswith(("recognise.", "speech.")))
+        return network
 
     def config(self) -> dict[str, object]:
         return asdict(self._config)
@@ -93,15 +98,21 @@ class EdgeTask:
             raise UsageError(f"the data was simulated for another transform, expected --hop {self.stft.hop}")
         inputs = [batch[name] for name in INPUTS]
         with torch.autocast(inputs[0].device.type, torch.bfloat16, enabled=self.half and network.training):
-            human, logit, _ = network(*inputs, network.initial_state(inputs[0].shape[0]))
+            *sounds, logit, _ = network(*inputs, network.initial_state(inputs[0].shape[0]))
         scale = batch["scale"][:, None, None, None]
-        human, clean = scale * human.float(), scale * batch["clean"]
-        wanted = clean + self.fan_kept * scale * batch["fan"] if self.fan_kept else clean
-        terms = edge_loss(human, logit.float(), clean, wanted, batch["active"], self.weights, batch["heed"])
+        clean, fan = scale * batch["clean"], scale * batch["fan"]
+        listen, recognise = (scale * sound.float() for sound in sounds)
+        terms, second = (
+            sound_loss(sound, clean, clean + kept * fan, self.weights)
+            for sound, kept in zip((listen, recognise), self.fans_kept, strict=True)
+        )
+        terms["speech"] = speech_loss(logit.float(), batch["active"], batch["heed"])
+        terms["recognise"] = second["total"]
+        terms["total"] = terms["total"] + self.weights.speech * terms["speech"] + terms["recognise"]
         if self.recogniser and network.training:
-            terms["recogniser"] = self.recogniser(human, clean)
+            terms["recogniser"] = self.recogniser(recognise, clean)
             terms["total"] = terms["total"] + self.recogniser_weight * terms["recogniser"]
-        return terms, human
+        return terms, listen
 
 
 class PaperTask:

@@ -95,7 +95,7 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--erb", type=int, help="bands as wide as the ear's, 64 say, in place of all frequencies")
     parser.add_argument(
-        "--recogniser", type=Path, metavar="WHISPER", help="folder whose encoder compares the answer too"
+        "--recogniser", type=Path, metavar="WHISPER", help="folder whose encoder compares the sound for a recogniser"
     )
     parser.add_argument("--recogniser-weight", type=float, default=0.1)
     parser.add_argument(
@@ -103,7 +103,13 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
         type=float,
         default=0.0,
         metavar="SHARE",
-        help="of the fan's amplitude that the answer should keep",
+        help="of the fan's amplitude that the sound to listen to should keep",
+    )
+    parser.add_argument(
+        "--fan-recognised", type=float, default=1.0, metavar="SHARE", help="of it in the sound for a recogniser"
+    )
+    parser.add_argument(
+        "--heads", action="store_true", help="train the head of the recogniser's sound and the speech head alone"
     )
     parser.add_argument("--suppression", type=float, default=LossWeights.suppression)
     parser.add_argument("--si-sdr", type=float, default=LossWeights.si_sdr)

@@ -219,10 +219,12 @@ def optimisers(network: nn.Module, rate: float) -> list[torch.optim.Optimizer]:
 
     Muon's steps are as large as AdamW's (Liu et al. 2025, "Muon is scalable for LLM training", eq. (4)).
     """
-    matrices = [weight for weight in network.parameters() if weight.ndim == 2 and min(weight.shape) > 1]
-    others = [weight for weight in network.parameters() if weight.ndim != 2 or min(weight.shape) == 1]
-    muon = Muon(matrices, lr=rate, weight_decay=1e-2, adjust_lr_fn="match_rms_adamw")
-    return [muon, torch.optim.AdamW(others, lr=rate, weight_decay=1e-2, betas=(0.9, 0.98))]
+    trained = [weight for weight in network.parameters() if weight.requires_grad]
+    matrices = [weight for weight in trained if weight.ndim == 2 and min(weight.shape) > 1]
+    others = [weight for weight in trained if weight.ndim != 2 or min(weight.shape) == 1]
+    adam = torch.optim.AdamW(others, lr=rate, weight_decay=1e-2, betas=(0.9, 0.98))
+    muon = [Muon(matrices, lr=rate, weight_decay=1e-2, adjust_lr_fn="match_rms_adamw")] if matrices else []
+    return [*muon, adam]
 
 
 def write_whole(state: Mapping[str, object], path: Path) -> None:

@@ -79,8 +79,8 @@ class Mixed:
 
     def step(self, frame: Frame, state: EngineState) -> tuple[Output, EngineState]:
         (ours, mine), (theirs, its) = self.engine.step(frame, state[0]), self.other.step(frame, state[1])
-        spectrum = (1 - self.share) * ours.spectrum + self.share * theirs.spectrum
-        return Output(spectrum.astype(np.complex64), ours.speech_probability), (mine, its)
+        recognise, listen = (1 - self.share) * ours.sounds + self.share * theirs.sounds
+        return Output(listen.astype(np.complex64), ours.speech_probability, recognise.astype(np.complex64)), (mine, its)
 
 
 @dataclass(frozen=True)
@@ -111,11 +111,11 @@ def frames(case: Case, stft: StftConfig, learning: bool) -> list[Frame]:
 
 
 def answer(engine: Engine, given: list[Frame], samples: int) -> Samples:
-    """Output of a stream with this engine, (samples,)."""
+    """The sound for a recogniser of a stream with this engine, (samples,)."""
     state, voice, hops = engine.initial_state(), Synthesiser(engine.stft), []
     for frame in given:
         output, state = step(engine, frame, state)
-        hops.append(voice.push(output.spectrum))
+        hops.append(voice.push(output.sounds[0]))
     return np.concatenate(hops)[engine.stft.window_length - engine.stft.hop :][:samples]
 
 

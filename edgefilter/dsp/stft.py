@@ -126,21 +126,22 @@ class Analyser:
 class Synthesiser:
     """Overlap-add; each frame finishes one hop of samples, which lag window_length - hop behind the frame's end.
 
-    sounds: of how many sounds, which differ in each frame by a gain alone; None for one, without an axis for them.
+    sounds: how many there are at once; None for one, without an axis for them.
     """
 
     def __init__(self, config: StftConfig, sounds: int | None = None) -> None:
         self.config = config
-        self._sum = np.zeros((*([sounds] if sounds else ()), config.window_length), np.float32)
-        self._frame = np.zeros(config.n_fft, np.float32)
-        self._weighted, self._window = self._frame[: config.window_length], config.synthesis_window
+        lead = (sounds,) if sounds else ()
+        self._sum = np.zeros((*lead, config.window_length), np.float32)
+        self._frame = np.zeros((*lead, config.n_fft), np.float32)
+        self._weighted, self._window = self._frame[..., : config.window_length], config.synthesis_window
 
-    def push(self, spectrum: Spectrum, *gains: float) -> Samples:
-        """Add one frame (bins,) complex64, times each sound's gain; return the (sounds, hop) samples that no later frame will change."""
+    def push(self, spectrum: Spectrum) -> Samples:
+        """Add one frame (sounds, bins) complex64; return the (sounds, hop) samples that no later frame will change."""
         total, hop = self._sum, self.config.hop
         fourier.irfft(np.asarray(spectrum, np.complex64), self.config.n_fft, out=self._frame)
         self._weighted *= self._window
-        total += np.multiply.outer(np.array(gains, np.float32), self._weighted) if gains else self._weighted
+        total += self._weighted
         done = total[..., :hop].copy()
         total[..., :-hop] = total[..., hop:]
         total[..., -hop:] = 0.0

@@ -79,11 +79,10 @@ class Fallback:
             return output, FallbackState(heard)
         if weight == 1.0:
             return other, FallbackState(coming)
-        spectrum = output.spectrum + np.float32(weight) * (other.spectrum - output.spectrum)
+        recognise, listen = output.sounds + np.float32(weight) * (other.sounds - output.sounds)
         louder = output if weight < 0.5 else other
-        return Output(spectrum, louder.speech_probability), FallbackState(
-            heard, coming, max(state.filling - 1, 0), weight
-        )
+        crossed = Output(listen, louder.speech_probability, recognise)
+        return crossed, FallbackState(heard, coming, max(state.filling - 1, 0), weight)
 
     def _move(self, weight: float, *indices: int) -> float:
         """The next weight of the engine that fades in, nearer to the one of the two whose index is closer to `wanted`.
@@ -145,7 +144,7 @@ class Judged:
     def step(self, frame: Frame, state: EngineState) -> tuple[Output, EngineState]:
         output, own = self._engine.step(frame, state[0])
         judged, other = self._judge.step(frame, state[1])
-        return Output(output.spectrum, judged.speech_probability), (own, other)
+        return output._replace(speech_probability=judged.speech_probability), (own, other)
 
 
 def with_network_as_judge(engine: Engine | ClipEngine, profile: Profile | None = None) -> Engine | ClipEngine:

@@ -22,6 +22,8 @@ SPECTRA = ("error", "mic", "reference", "echo")
 """The graph's first inputs, each (1, bins, 2) float32, real and imaginary part."""
 POWERS = ("noise_psd", "residual_psd")
 """Those that follow, each (1, bins) float32, as in Frame."""
+SOUNDS = ("spectrum", "recognise")
+"""Outputs of the graph, each (1, bins, 2) float32: the sound to listen to, and the one for a recogniser, which a graph may lack."""
 VARIABLE = "EDGEFILTER_CRNN"
 LOUDEST = 1.26
 """Most power of a frame of the answer, over the microphone's: 1 dB. The shipped network stays below; others are turned down."""
@@ -88,7 +90,9 @@ class Crnn:
         states = dict(self.model.states)
         spectrum = (1, self.stft.bins, 2)
         following = {f"next_{name}": shape for name, shape in states.items()}
-        outputs = {"spectrum": spectrum, "speech_probability": (1,), **following}
+        given = {slot.name for slot in self.model.session.get_outputs()}
+        sounds = dict.fromkeys([name for name in SOUNDS if name in given] or SOUNDS, spectrum)
+        outputs = {**sounds, "speech_probability": (1,), **following}
         powers = dict.fromkeys(POWERS, (1, self.stft.bins))
         expect_slots(self.model, {**dict.fromkeys(SPECTRA, spectrum), **powers, **states}, outputs)
         self._own = threading.local()
@@ -101,7 +105,7 @@ class Crnn:
         power = np.ones(self.stft.bins, np.float32)
         frame, one = Frame(mic, reference, echo, error, power, power), np.float32(1.0)
         places = self._run(frame, self.initial_state()[0], one, one)
-        return [places.spectrum, places.probability, *places.next_states]
+        return [places.sounds, places.probability, *places.next_states]
 
     def initial_state(self) -> CrnnState:
         tensors = tuple(np.zeros(shape, np.float32) for _, shape in self.model.states)
@@ -113,19 +117,20 @@ class Crnn:
         mic, reference = mic.after(heard), reference.after(_power(frame.reference))
         scale = mic.factor(LOUD[0])
         places = self._run(frame, tensors, scale, reference.factor(LOUD[1]))
-        human: Spectrum = places.spectrum * np.float32(1.0 / scale)
+        sounds: Spectrum = places.sounds * np.float32(1.0 / scale)
         if self._ss_helps:
             masked, mask = self._ss.step(frame, mask)
-            human = (1 - SHARE_OF_SS) * human + SHARE_OF_SS * masked.spectrum
+            sounds = (1 - SHARE_OF_SS) * sounds + SHARE_OF_SS * masked.spectrum
         if frame.idle:
-            human = _with_what_is_sure(human, frame)
-        power = _power(human)
-        gain = _limited(power, LOUDEST * heard)
+            sounds = _with_what_is_sure(sounds, frame)
+        powers = [_power(sound) for sound in sounds]
+        gain = _limited(max(powers), LOUDEST * heard)
         if gain is None:  # numbers have grown beyond all bounds: begin anew, and until then the linear stage alone
             return Output(frame.error, 0.0), self.initial_state()
         following = tuple(place.copy() for place in places.next_states)
-        speaks = 0.0 if power < FAINT * mic.loudest else min(max(places.probability.item(), 0.0), 1.0)
-        return Output(gain * human, speaks), (following, mask, (mic, reference))
+        speaks = 0.0 if powers[0] < FAINT * mic.loudest else min(max(places.probability.item(), 0.0), 1.0)
+        listen, *recognise = gain * sounds
+        return Output(listen, speaks, *recognise), (following, mask, (mic, reference))
 
     def _run(self, frame: Frame, state: tuple[Samples, ...], mic: np.float32, reference: np.float32) -> Places:
         """Run the network on a frame whose microphone and reference are scaled by these factors; its answers are in what is returned."""
@@ -144,7 +149,7 @@ class Crnn:
 class Places:
     """Where one frame's inputs go and its outputs come, of one thread; new arrays in each call take a tenth of a paced frame.
 
-    inputs: (bins,) by the name of the Frame's field that goes there. spectrum: (bins,) complex64.
+    inputs: (bins,) by the name of the Frame's field that goes there. sounds: (1 or 2, bins) complex64, in the order of SOUNDS.
     """
 
     def __init__(self, model: Model) -> None:
@@ -156,25 +161,29 @@ class Places:
                 bind(name, "cpu", 0, np.float32, place.shape, place.ctypes.data)
         spectra = [(name, given[name].view(np.complex64).ravel()) for name in SPECTRA]
         self.inputs = [*spectra, *((name, given[name].ravel()) for name in POWERS)]
-        self.spectrum: Spectrum = made["spectrum"].view(np.complex64).ravel()
+        self._sounds: list[Spectrum] = [made[name].view(np.complex64).ravel() for name in SOUNDS if name in made]
         self.probability = made["speech_probability"]
         self.states = [given[name] for name, _ in model.states]
         self.next_states = [made[f"next_{name}"] for name, _ in model.states]
+
+    @property
+    def sounds(self) -> Spectrum:
+        return np.stack(self._sounds)
 
     def run(self) -> None:
         """From what stands in the places of the inputs to those of the outputs."""
         self._session.run_with_iobinding(self._binding)
 
 
-def _with_what_is_sure(human: Spectrum, frame: Frame) -> Spectrum:
-    """The answer, in no bin below the error less SURE times the expected powers (spectral subtraction, Boll 1979)."""
-    human, error = human.copy(), frame.error
+def _with_what_is_sure(sounds: Spectrum, frame: Frame) -> Spectrum:
+    """The sounds (sounds, bins), in no bin below the error less SURE times the expected powers (spectral subtraction, Boll 1979)."""
+    error = frame.error
     power = fourier.power(error)
     least = power - np.float32(SURE) * (frame.noise_psd + frame.residual_psd)
     with np.errstate(over="ignore"):  # of a network that has grown beyond all bounds
-        short = least > fourier.power(human)
-    human[short] = np.sqrt(least[short] / power[short]) * error[short]
-    return human
+        short = least > fourier.power(sounds)
+    sure = np.sqrt(np.maximum(least, 0.0) / (power + fourier.TINY)) * error
+    return np.where(short, sure, sounds)
 
 
 def _power(spectrum: Spectrum) -> float:

@@ -142,7 +142,7 @@ class Stream:
         rest = self._run(np.zeros((*lead, padding.size), np.float32), padding)
         if self.engine.lookahead is None:
             answer = self.engine.answer(self._clip)
-            rest = self._finish([self._synthesiser.push(spectrum, 1.0, 1.0) for spectrum in answer])
+            rest = self._finish([self._synthesiser.push(np.stack((spectrum, spectrum))) for spectrum in answer])
         if talk := self.barge_in.end():
             self._tell_of_speech(talk, "the recording has ended")
         return self._deliver(rest[:, :missing])
@@ -231,13 +231,15 @@ class Stream:
             return NOTHING
         output, self._state = step(engine, frame, self._state)
         if output.speech_probability is not None:
-            self._turns.step(output.spectrum, frame.error, self.front.errors)
+            self._turns.step(output.sounds[0], frame.error, self.front.errors)
         said = output.speech_probability
         human = None if said is None else human_probability(said)
         self._judge_speech(human, frame, aligned)
         self.front.hear(frame, output, self.speech_probability, self.barge_in.speaking)
-        listen = 1.0 if human is None or self.barge_in.speaking else NOBODY ** (1.0 - human)
-        return self._synthesiser.push(output.spectrum, 1.0, listen)
+        sounds = output.sounds
+        if human is not None and not self.barge_in.speaking:
+            sounds[1] *= np.float32(NOBODY ** (1.0 - human))
+        return self._synthesiser.push(sounds)
 
     @property
     def voice_gain(self) -> float:

@@ -20,10 +20,11 @@ TRAINING = {"data": "none: random weights", "seed": 0}
 
 
 def tiny_edge() -> EdgeCrnn:
-    """The edge network with as few channels as it takes, and a correction that is not zero."""
+    """The edge network with as few channels as it takes, and corrections that are not zero."""
     torch.manual_seed(0)
     network = EdgeCrnn(EdgeConfig(channels=(2, 2, 2, 2), hidden=6)).eval()
-    torch.nn.init.normal_(network.mask.weight)
+    for last in (network.mask, network.recognise[-1]):
+        torch.nn.init.normal_(last.weight)
     return network
 
 

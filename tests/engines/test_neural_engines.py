@@ -57,10 +57,11 @@ def test_crnn_answers_what_onnxruntime_answers_for_the_same_frames():
         spectra = scale * error, scale * mic, of_reference * reference, scale * echo
         pairs = [np.stack((x.real, x.imag), axis=-1)[None] for x in spectra]
         powers = [scale**2 * noise[None], scale**2 * residual[None]]
-        found, probability, *theirs = session.run(
+        listen, recognise, probability, *theirs = session.run(
             None, dict(zip([slot.name for slot in session.get_inputs()], pairs + powers + theirs, strict=True))
         )
-        np.testing.assert_array_equal(output.spectrum, np.float32(1 / scale) * (found[0, :, 0] + 1j * found[0, :, 1]))
+        for sound, found in ((output.spectrum, listen), (output.recognise, recognise)):
+            np.testing.assert_array_equal(sound, np.float32(1 / scale) * (found[0, :, 0] + 1j * found[0, :, 1]))
         assert output.speech_probability == probability[0] and 0 < probability[0] < 1
     assert any(tensor.any() for tensor in state[0])
 

@@ -122,12 +122,14 @@ def test_the_engine_computes_what_torch_computes(exported):
         pairs = [torch.view_as_real(torch.from_numpy(x))[None] for x in (error, mic, reference, echo)]
         powers = [torch.from_numpy(x)[None] for x in (noise, residual)]
         with torch.no_grad():
-            spectrum, probability, ours = network.step(*pairs, *powers, ours)
+            listen, recognise, probability, ours = network.step(*pairs, *powers, ours)
         heard = Frame(mic, reference, echo, error, noise, residual)
         theirs = theirs[:2] + (as_loud_as_in_training(),)
         output, theirs = engine.step(heard, theirs)
         # 1e-4: the bound of the export, on values of about 1
-        np.testing.assert_allclose(output.spectrum, torch.view_as_complex(spectrum)[0].numpy(), atol=1e-4)
+        for found, wanted in ((output.spectrum, listen), (output.recognise, recognise)):
+            np.testing.assert_allclose(found, torch.view_as_complex(wanted)[0].numpy(), atol=1e-4)
+        assert np.abs(output.recognise - output.spectrum).max() > 0.01
         assert output.speech_probability == pytest.approx(float(probability[0]), abs=1e-4)
     for mine, found in zip(ours, theirs[0], strict=True):
         np.testing.assert_allclose(found, mine.numpy(), atol=1e-4)
@@ -140,14 +142,15 @@ def test_the_rewritten_graph_answers_like_the_network_whatever_its_shape(norm, e
     torch.manual_seed(4)
     shape = {"channels": (3, 4, 5, 6), "hidden": 7, "layers": 3, "norm": norm, "erb": erb}
     network = EdgeCrnn(EdgeConfig(n_fft=512, hop=256, **shape)).eval()
-    torch.nn.init.normal_(network.mask.weight)
+    for last in (network.mask, network.recognise[-1]):
+        torch.nn.init.normal_(last.weight)
     state = [torch.rand_like(tensor) for tensor in network.initial_state()]
     spectra = [10.0 ** torch.empty(1, 257, 1).uniform_(-6, 0) * torch.randn(1, 257, 2) for _ in range(4)]
     powers = [10.0 ** torch.empty(1, 257).uniform_(-9, 0) for _ in range(2)]
     with torch.no_grad():
-        spectrum, probability, following = network.step(*spectra, *powers, tuple(state))
+        *answers, following = network.step(*spectra, *powers, tuple(state))
         found = EdgeGraph(network, products)(*spectra, *powers, *state)
-    for wanted, tensor in zip((spectrum, probability, *following), found, strict=True):
+    for wanted, tensor in zip((*answers, *following), found, strict=True):
         torch.testing.assert_close(tensor, wanted, atol=1e-5, rtol=1e-5)
 
 
@@ -190,8 +193,8 @@ def test_parity_compares_the_state_too(exported):
     network = edge()
 
     def step(*inputs):
-        spectrum, probability, (*others, hidden) = EdgeCrnn.step(network, *inputs)
-        return spectrum, probability, (*others, hidden + 1e-3)
+        *answers, (*others, hidden) = EdgeCrnn.step(network, *inputs)
+        return *answers, (*others, hidden + 1e-3)
 
     network.step = step
     with pytest.raises(ModelError, match="not written"):

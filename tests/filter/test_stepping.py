@@ -20,7 +20,7 @@ from edgefilter.errors import UsageError
 from edgefilter.filter.stepping import MOST_PATIENCE_S, PATIENCE_S, Stepping
 from edgefilter.filter.stream import Stream
 from edgefilter.filter.timing import Histogram
-from edgefilter.types import SAMPLE_RATE, Output
+from edgefilter.types import SAMPLE_RATE, Frame, Output
 from tests import conformance
 
 HOP = 256
@@ -155,6 +155,28 @@ def test_a_step_does_not_click():
     assert click_db(out) < click_db(cut) - 35
     steepest = np.abs(np.diff(mic)).max()
     assert np.abs(np.diff(out)).max() < 1.01 * steepest  # nowhere steeper than the tone itself
+
+
+class Twofold(Bypass):
+    """The microphone to listen to, twice of it for a recogniser."""
+
+    def step(self, frame, state):
+        return Output(frame.mic, None, 2 * frame.mic), state
+
+
+def test_both_sounds_fade_to_an_engine_that_has_one():
+    engine = Fallback((Twofold(), Quiet()))
+    state, (mic, *rest) = (
+        engine.initial_state(),
+        np.random.default_rng(0).standard_normal((6, engine.stft.bins)).astype(np.complex64),
+    )
+    frame = Frame(mic, *rest)
+    engine.wanted, found = 1, []
+    for _ in range(DOWN):
+        output, state = engine.step(frame, state)
+        found.append([np.vdot(frame.mic, sound).real / np.vdot(frame.mic, frame.mic).real for sound in output.sounds])
+    steps = np.arange(1, DOWN + 1)[:, None] / DOWN
+    np.testing.assert_allclose(found, (1 - steps) * (2.0, 1.0) + steps * (0.1, 0.1), rtol=1e-5)
 
 
 def test_a_request_during_a_crossfade_turns_it_back():

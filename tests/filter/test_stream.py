@@ -162,6 +162,27 @@ def test_two_sounds_of_the_same_block_differ_where_nobody_speaks():
     assert np.allclose(listen[9000:], recognise[9000:], atol=1e-6)
 
 
+class Twofold(Bypass):
+    """Half the microphone to listen to, all of it for a recogniser; somebody always speaks."""
+
+    def step(self, frame, state):
+        return Output(frame.error * np.float32(0.5), 1.0, frame.error), state
+
+
+def test_an_engine_may_give_another_sound_for_a_recogniser_which_turns_have_too():
+    mic = 0.1 * np.random.default_rng(0).standard_normal(32000).astype(np.float32)
+    stream = Stream(Twofold())
+    recognise, listen = [
+        np.concatenate(s) for s in zip(*((stream.process(mic, mic), stream.other), (stream.flush(), stream.other)))
+    ]
+    whole = enhance(mic, mic, engine="bypass")
+    np.testing.assert_allclose(recognise, whole, atol=1e-6)
+    np.testing.assert_allclose(listen[4000:], 0.5 * whole[4000:], atol=1e-6)
+    *_, turn = (event.turn for event in stream.events if event.turn is not None)
+    assert turn.start == 0
+    np.testing.assert_allclose(turn.samples[: whole.size], whole, atol=1e-5)
+
+
 def test_an_engine_that_judges_no_speech_has_one_sound_and_no_third_is_known():
     ego = EgoFilter(engine="linear", output="listen")
     out = ego.process(*conformance.conversation(3000))
