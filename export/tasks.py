@@ -75,12 +75,12 @@ class EdgeTask:
             if not 0.0 <= share <= 1.0:
                 raise UsageError(f"{name} is {share:g}, expected 0 to 1")
         self.fans_kept = options.fan_kept, options.fan_recognised
-        self.recogniser_weight, self.heads = options.recogniser_weight, options.heads
+        self.recogniser_weight, self.second_alone = options.recogniser_weight, options.second_alone
 
     def network(self) -> EdgeCrnn:
         network = EdgeCrnn(self._config).to(memory_format=torch.channels_last)
         for name, weight in network.named_parameters():
-            weight.requires_grad_(not self.heads or name.startswith(("recognise.", "speech.")))
+            weight.requires_grad_(not self.second_alone or name.startswith("recognise."))
         return network
 
     def config(self) -> dict[str, object]:

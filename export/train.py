@@ -109,7 +109,7 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
         "--fan-recognised", type=float, default=1.0, metavar="SHARE", help="of it in the sound for a recogniser"
     )
     parser.add_argument(
-        "--heads", action="store_true", help="train the head of the recogniser's sound and the speech head alone"
+        "--second-alone", action="store_true", help="train the head of the sound for a recogniser, and nothing else"
     )
     parser.add_argument("--suppression", type=float, default=LossWeights.suppression)
     parser.add_argument("--si-sdr", type=float, default=LossWeights.si_sdr)

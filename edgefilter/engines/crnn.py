@@ -23,7 +23,8 @@ SPECTRA = ("error", "mic", "reference", "echo")
 POWERS = ("noise_psd", "residual_psd")
 """Those that follow, each (1, bins) float32, as in Frame."""
 SOUNDS = ("spectrum", "recognise")
-"""Outputs of the graph, each (1, bins, 2) float32: the sound to listen to, and the one for a recogniser, which a graph may lack."""
+"""Outputs of the graph, each (1, bins, 2) float32: the sound to listen to, and the one for a recogniser, which a graph may lack and
+which is used while the robot is silent: only there it has fewer wrong words (models/MODELS.md)."""
 VARIABLE = "EDGEFILTER_CRNN"
 LOUDEST = 1.26
 """Most power of a frame of the answer, over the microphone's: 1 dB. The shipped network stays below; others are turned down."""
@@ -130,7 +131,7 @@ class Crnn:
         following = tuple(place.copy() for place in places.next_states)
         speaks = 0.0 if powers[0] < FAINT * mic.loudest else min(max(places.probability.item(), 0.0), 1.0)
         listen, *recognise = gain * sounds
-        return Output(listen, speaks, *recognise), (following, mask, (mic, reference))
+        return Output(listen, speaks, *(recognise if frame.idle else ())), (following, mask, (mic, reference))
 
     def _run(self, frame: Frame, state: tuple[Samples, ...], mic: np.float32, reference: np.float32) -> Places:
         """Run the network on a frame whose microphone and reference are scaled by these factors; its answers are in what is returned."""

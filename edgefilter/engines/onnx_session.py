@@ -29,8 +29,8 @@ _PACKAGE = Path(__file__).parent.parent
 FOLDERS = (_PACKAGE / "models", _PACKAGE.parent / "models")
 """Where models lie: inside the installed package, or at the top of a checkout."""
 SHIPPED = {
-    "crnn.onnx": "afe41e5c116cde75e1ebf4719c38fb8ef6d7e574410a2ac62a3355e6bd6f96ca",
-    "crnn_int8.onnx": "a89638878980c9c6d6e8b532663d8dca36b5549f941b1861a5be6498d3082bb8",
+    "crnn.onnx": "76a44dbb9b168afbcea34928b66dbb64d224704933dfd7d5b5bd95eb9eda4070",
+    "crnn_int8.onnx": "77d836fb4871b2a8cbd32c5a151442eb6e12df80a7ce33f8f4e78e7ff3e5faa4",
 }
 """sha256 of the files in models/, as MODELS.md lists them."""
 MOST_BYTES, MOST_STATE, MOST_FFT = 512 * 2**20, 1 << 22, 1 << 14

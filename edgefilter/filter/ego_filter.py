@@ -58,9 +58,10 @@ class EgoFilter:
         "speech_dismissed" where nobody spoke, 0.3 s later at most (`BargeInSettings.confirm_s`), or as long after a lower
         voice is heard (`voice_gain`).
     output : str
-        Which of two sounds `process` returns; `other` gives the other one. "recognise": for a recogniser, with more of the
-        fan and fewer gaps in the voice. "listen": for a call, a level meter or a detector of speech; up to 14 dB lower where
-        the engine hears nobody speak. An engine without a network has one sound for both. Events and turns do not depend on it.
+        Which of two sounds `process` returns; `other` gives the other one. "recognise": for a recogniser; while the robot is
+        silent with more of the fan and fewer gaps in the voice. "listen": for a call, a level meter or a detector of speech;
+        up to 14 dB lower where the engine hears nobody speak. An engine without a network has one sound for both. Events do
+        not depend on it, and turns are for a recogniser.
 
     Attributes
     ----------

@@ -52,7 +52,8 @@ def test_crnn_answers_what_onnxruntime_answers_for_the_same_frames():
         error, mic, reference, echo = (spectrum(rng, engine.stft.bins) for _ in range(4))
         noise, residual = rng.random((2, engine.stft.bins)).astype(np.float32)
         heard = Frame(mic=mic, reference=reference, echo=echo, error=error, noise_psd=noise, residual_psd=residual)
-        output, state = engine.step(heard, state)
+        busy, (output, state) = engine.step(heard, state)[0], engine.step(heard._replace(idle=True), state)
+        assert busy.recognise is None and np.array_equal(busy.sounds[0], output.spectrum)
         scale, of_reference = (level.factor(usual) for usual, level in zip(LOUD, state[2], strict=True))
         spectra = scale * error, scale * mic, of_reference * reference, scale * echo
         pairs = [np.stack((x.real, x.imag), axis=-1)[None] for x in spectra]

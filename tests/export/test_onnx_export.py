@@ -123,7 +123,7 @@ def test_the_engine_computes_what_torch_computes(exported):
         powers = [torch.from_numpy(x)[None] for x in (noise, residual)]
         with torch.no_grad():
             listen, recognise, probability, ours = network.step(*pairs, *powers, ours)
-        heard = Frame(mic, reference, echo, error, noise, residual)
+        heard = Frame(mic, reference, echo, error, noise, residual, idle=True)
         theirs = theirs[:2] + (as_loud_as_in_training(),)
         output, theirs = engine.step(heard, theirs)
         # 1e-4: the bound of the export, on values of about 1
