@@ -383,7 +383,7 @@ class Clip:
 
     set: str
     room: str
-    source: Conversation | Recording | Laid
+    source: Conversation | Recording | Laid | RobotSilent
     speaker: str = ""
     place: str = ""
     text: str | None = None
@@ -472,6 +472,25 @@ class Clip:
             made = make()
             self._kept[name] = made, time.perf_counter() - began
         return self._kept[name][0]
+
+
+@dataclass(frozen=True)
+class RobotSilent:
+    """A simulated conversation in which the robot says nothing: the human, and the fan as it was calibrated."""
+
+    clip: Clip
+
+    @property
+    def name(self) -> str:
+        return f"{self.clip.source.name}, robot silent"
+
+    @property
+    def profile(self) -> Profile | None:
+        return self.clip.profile
+
+    def signals(self) -> Signals:
+        human = self.clip.known_human()
+        return Signals(human + self.clip.fan(), np.zeros_like(human), human, self.clip.span)
 
 
 def conversation_clips(folder: Path) -> Iterator[Clip]:

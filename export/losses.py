@@ -46,8 +46,8 @@ def power_law_loss(mask: Tensor, mixture: Tensor, clean: Tensor, exponent: float
 def sound_loss(human: Tensor, clean: Tensor, wanted: Tensor, weights: LossWeights) -> dict[str, Tensor]:
     """Terms of one of the network's sounds and their weighted "total".
 
-    human, clean, wanted: (batch, frames, bins, 2), scaled so that speech is near 1; wanted is the human with as much of
-    the fan as the estimate should keep. suppression counts once more where the estimate is below what is wanted: words
+    human, the estimate, clean, the true voice, and wanted, that voice with as much of the fan as the estimate should keep:
+    (batch, frames, bins, 2), scaled so that speech is near 1. suppression counts once more where the estimate is below what is wanted: words
     that are gone do not come back (Braun & Tashev 2020 compress likewise; the asymmetry follows Wang et al. 2020,
     "VoiceFilter-Lite", eq. (2)).
     """

@@ -166,7 +166,7 @@ class EdgeCrnn(nn.Module):
         residual: Tensor,
         state: tuple[Tensor, ...],
     ) -> tuple[Tensor, Tensor, Tensor, tuple[Tensor, ...]]:
-        """Both spectra, logits (batch, frames) and the next state, of spectra (batch, frames, bins, 2) and powers (batch, frames, bins)."""
+        """Both spectra, logits (batch, frames) and the next state from spectra (batch, frames, bins, 2) and powers (batch, frames, bins)."""
         batch, frames = error.shape[:2]
         mic_x, mic_last = _with_previous(torch.cat((features(error), features(mic)), -1), state[0])
         ref_x, ref_last = _with_previous(torch.cat((features(reference), features(echo)), -1), state[1])
@@ -193,7 +193,7 @@ class EdgeCrnn(nn.Module):
         return self.joint_2(j1), (m1, r1, m2, r2, j1)
 
     def decode(self, remembered: Tensor, met: Tensor, skips: tuple[Tensor, ...]) -> Tensor:
-        """The GRU's output with what `encode` gave to the raw corrections (n, 4, 1, bands): two of each sound."""
+        """The raw corrections (n, 4, 1, bands), two for each sound, from the GRU's output (remembered) and both outputs of `encode`."""
         m1, r1, m2, r2, j1 = skips
         y = torch.relu(self.outward(remembered)).reshape(met.shape)
         if not met.is_contiguous():

@@ -95,7 +95,10 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--erb", type=int, help="bands as wide as the ear's, 64 say, in place of all frequencies")
     parser.add_argument(
-        "--recogniser", type=Path, metavar="WHISPER", help="folder whose encoder compares the sound for a recogniser"
+        "--recogniser",
+        type=Path,
+        metavar="WHISPER",
+        help="folder of the recogniser whose encoder compares the second sound with the human alone",
     )
     parser.add_argument("--recogniser-weight", type=float, default=0.1)
     parser.add_argument(
@@ -103,10 +106,10 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
         type=float,
         default=0.0,
         metavar="SHARE",
-        help="of the fan's amplitude that the sound to listen to should keep",
+        help="share of the fan's amplitude that the sound to listen to should keep, 0 to 1",
     )
     parser.add_argument(
-        "--fan-recognised", type=float, default=1.0, metavar="SHARE", help="of it in the sound for a recogniser"
+        "--fan-recognised", type=float, default=1.0, metavar="SHARE", help="the same of the sound for a recogniser"
     )
     parser.add_argument(
         "--second-alone", action="store_true", help="train the head of the sound for a recogniser, and nothing else"

@@ -32,6 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--cases", type=int, default=8, metavar="N", help="humans that are laid on them at each level")
     add("--networks", type=Path, nargs="*", default=[], metavar="FILE.onnx", help="words: trained networks")
     add("--cold", action="store_true", help="words: each conversation once more without its profile")
+    add("--silent", action="store_true", help="words: each conversation once more in which the robot says nothing")
     add("--learning", action="store_true", help="words: the filter learns while it runs")
     add("--wiener", type=float, nargs="*", default=[0.5], metavar="SHARE", help="words: shares of 'ss' in the answer")
     add("--error", type=float, nargs="*", default=[0.2], metavar="SHARE", help="words: shares of the linear error")

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -20,7 +20,7 @@ import numpy as np
 from bench import provenance, recordings, results, runner
 from bench.cache import Cache
 from bench.metrics import SECOND, CachedMetrics, difference, mean, middle, pooled
-from bench.recordings import Cells, Clip, progress
+from bench.recordings import Cells, Clip, RobotSilent, progress
 from edgefilter import PathLearner
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.dsp.stft import StftConfig, Synthesiser
@@ -37,8 +37,8 @@ from edgefilter.types import Frame, Output, Samples
 REAL = Cells(sers=(-10.0, -20.0), befores=(0.0, 10.0))
 """Of humans laid on real loudspeakers."""
 BASE = "ss"
-COLD, LAID = " cold", "real loudspeaker"
-"""How the kind of a conversation without its profile ends, and the kind of humans laid on real loudspeakers."""
+COLD, SILENT, LAID = " cold", " robot silent", "real loudspeaker"
+"""How the kind of a conversation without its profile ends, and of one without its robot; the kind of humans laid on real loudspeakers."""
 
 
 class Case(NamedTuple):
@@ -111,7 +111,7 @@ def frames(case: Case, stft: StftConfig, learning: bool) -> list[Frame]:
 
 
 def answer(engine: Engine, given: list[Frame], samples: int) -> Samples:
-    """The sound for a recogniser of a stream with this engine, (samples,)."""
+    """The sound for a recogniser that the engine makes of these frames, (samples,)."""
     state, voice, hops = engine.initial_state(), Synthesiser(engine.stft), []
     for frame in given:
         output, state = step(engine, frame, state)
@@ -175,6 +175,8 @@ def cases(options: argparse.Namespace) -> list[Case]:
     for name, clip in recordings.every(sets, options.every, options.limit):
         found.append(Case(f"{name} {clip.room}", clip, clip.profile))
         found += [Case(f"{name} {clip.room}{COLD}", clip, None)] * options.cold
+        if options.silent:
+            found.append(Case(f"{name} {clip.room}{SILENT}", replace(clip, source=RobotSilent(clip)), clip.profile))
     if options.alone:
         laid = recordings.lay(options.alone, options.speech, REAL, options.cases, options.seed)
         clips = recordings.named(recordings.laid_clips(laid, options.speech, LAID), "real")
@@ -183,11 +185,12 @@ def cases(options: argparse.Namespace) -> list[Case]:
 
 
 def tables(rows: Sequence[dict]) -> list[dict]:
-    """A table per kind, one of the conversations with their profile, one of those without, and one of all."""
+    """A table per kind, one of the conversations with their profile, one of those without, one without the robot, and one of all."""
     kinds = {kind: [row for row in rows if row["kind"] == kind] for kind in dict.fromkeys(row["kind"] for row in rows)}
     cold = [kind for kind in kinds if kind.endswith(COLD)]
-    warm = [kind for kind in kinds if kind not in (*cold, LAID)]
-    groups = {"with a calibration": warm, "without": cold, "all": list(kinds)}
+    silent = [kind for kind in kinds if kind.endswith(SILENT)]
+    warm = [kind for kind in kinds if kind not in (*cold, *silent, LAID)]
+    groups = {"with a calibration": warm, "without": cold, "robot silent": silent, "all": list(kinds)}
     together = {name: [row for kind in of for row in kinds[kind]] for name, of in groups.items() if len(of) > 1}
     judges = {"": ""} | ({SECOND: "second: "} if any(f"{SECOND}capped" in row for row in rows) else {})
     heads = (("WER, %", 0), ("left out", 0), ("put in", 0), ("WER less that of ss, points", 1))

@@ -223,7 +223,7 @@ class Aligner:
         return self._odds(found) > CERTAIN * (CERTAIN if self._displaced else 1.0)
 
     def _odds(self, found: Found) -> float:
-        """The odds of a lag that a search found: of an utterance that begins at another lag than is followed, robots repeat one of before."""
+        """The odds of a lag that a search found, lower for an utterance that seems to begin at another lag: robots repeat earlier utterances."""
         if not self._open or self._open[0].lost or not abs(found.lag - self._drift.delay) > SAME:
             return found.odds
         followed = (look for look in self._looks if not look.heard and look.odds > CERTAIN)
@@ -500,7 +500,7 @@ class Aligner:
                 start = self._read_at = float(round(self._read_at))
             if abs(start - self._read_at) > 0.5:
                 start, switched = self._read_at - slope * self.hop, True
-            # one that is lost may only have moved away, and be softer there, unless samples are missing: then its lag has grown again
+            # a lost utterance may only have become softer, as the robot moves; where samples are missing (`belief.lost`) it has begun at a longer lag
             begun = self._known and self._open and (not self._open[0].lost or self._belief.lost)
             if begun and self._gain is not None and end - delay > self._open[0].start:
                 brought = self._ref.read(end - round(delay) - self.hop, end - round(delay))

@@ -32,8 +32,8 @@ class CoarseLag:
     """Correlates the shapes of the spectra of microphone and reference at every lag, hop by hop.
 
     A shape is the log energies of BANDS bands, less their means over time and over the bands. It has no phase and no level,
-    so that neither a diffuse path nor a processed microphone hides the lag. What a voice has in common with itself a
-    while ago shows beside the right lag, so other lags count by what that leaves of theirs. hop: samples per step, and
+    so that neither a diffuse path nor a processed microphone hides the lag. A voice is like itself a while ago,
+    so lags beside the right one score too: what the best lag explains of their scores is subtracted. hop: samples per step, and
     resolution. max_lag: samples.
 
     >>> rng = np.random.default_rng(0)
@@ -90,7 +90,7 @@ class CoarseLag:
         heard = (self._frames - at) * self._hop / SAMPLE_RATE
         if heard < ENOUGH_S or score[at] ** 2 <= np.delete(left, near).max(initial=CHANCE):
             return None
-        # of Gaussian shapes that are independent from hop to hop, the likelihood of its neighbours
+        # likelihood of the lags beside the best, of Gaussian shapes that are independent from hop to hop
         unlike = np.maximum(1.0 - np.square(score[near]), fourier.TINY)
         odds = (unlike.min() / unlike) ** (0.5 * min(heard, MEMORY_S) * SAMPLE_RATE / self._hop)
         return at * self._hop, self._hop * math.sqrt(1 / 12 + np.average((near - at) ** 2, weights=odds))

@@ -240,7 +240,7 @@ class DriftFilter:
 
     @property
     def deviation(self) -> float:
-        """Standard deviation of the delay, samples, with what all looks err alike (shared), so that none corrects it."""
+        """Standard deviation of the delay, samples, with the error that all measurements share, which no further one reduces."""
         return math.hypot(math.sqrt(self._variance), self.shared)
 
     def restart(self, delay: float, deviation: float = SMALL / EXPECTED) -> None:

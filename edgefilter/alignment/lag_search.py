@@ -144,12 +144,12 @@ class LagSearch:
     def find(self) -> Found | None:
         """The likeliest lag; None where there is nothing to compare, or less than MINIMUM of it would overlap.
 
-        Log likelihoods of a lag in noise of each microphone's own grow with its correlations, so these are summed. Of three or more, the
-        highest at a lag counts as the next one: a lag that only one channel shows may be a loopback's.
+        The microphones' correlations are summed: where their noises are independent, the log likelihood of a lag grows with each. Of three
+        or more the highest at a lag is lowered to the second highest, since a peak in one channel alone may be a loopback's.
         """
         if not self._crosses:
             return None
-        # the energy of the reference, first difference, that falls under the microphone's window, at every SAME-th lag
+        # energy of the reference's first difference within the microphone's window, at every SAME-th lag: it hardly changes between
         late = self._at - self._prepared
         lags, last = np.arange(0, self._lags, SAME) - self._early, self._total.size - 1
         upper, lower = (np.clip((end + late - lags) // SAME, 0, last) for end in (self._size, self._start))
@@ -165,7 +165,7 @@ class LagSearch:
         return Found(lag, _clearness(score, at), self._at, heard) if heard >= MINIMUM and score[at] > 0.0 else None
 
     def _scored(self, cross: np.ndarray, before: int, weight: Samples) -> Samples:
-        """The correlation from `before` lags before 0 on, weighted (lags,) by what a lag lets overlap, over its own root mean square."""
+        """The correlation at lags from -before on, times a weight (lags,) that allows for their overlap, divided by its root mean square."""
         correlation = fft.irfft(cross, self._size)
         score = np.concatenate((correlation[self._size - before :], correlation[: self._lags - before]))
         if not self._signed:

@@ -49,8 +49,8 @@ class Utterance:
     """A stretch of speech in the reference, positions in samples; start lies up to two hops before the first sound.
 
     after: end of the one before it, which the microphone hears out first, since one loudspeaker plays them in turn.
-    lost: whether it is one that was followed and is looked for again, not one that began; nearby: searches left that
-    suppose it to have jumped a short while ago, its start moving along. refuted: whether it is not heard at the lag of before.
+    lost: whether it is one that was followed and is looked for again, not one that began; nearby: how many more
+    searches assume that its lag jumped only lately, and move its start along. refuted: whether it is not heard at the lag of before.
     """
 
     start: int

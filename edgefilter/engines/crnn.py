@@ -177,7 +177,10 @@ class Places:
 
 
 def _with_what_is_sure(sounds: Spectrum, frame: Frame) -> Spectrum:
-    """The sounds (sounds, bins), in no bin below the error less SURE times the expected powers (spectral subtraction, Boll 1979)."""
+    """The sounds (sounds, bins), each bin raised to what spectral subtraction (Boll 1979) leaves of the error.
+
+    SURE times the expected powers of noise and residual echo are subtracted.
+    """
     error = frame.error
     power = fourier.power(error)
     least = power - np.float32(SURE) * (frame.noise_psd + frame.residual_psd)

@@ -59,9 +59,9 @@ class EgoFilter:
         voice is heard (`voice_gain`).
     output : str
         Which of two sounds `process` returns; `other` gives the other one. "recognise": for a recogniser; while the robot is
-        silent with more of the fan and fewer gaps in the voice. "listen": for a call, a level meter or a detector of speech;
+        silent it keeps more of the fan and has fewer gaps in the voice. "listen": for a call, a level meter or a detector of speech;
         up to 14 dB lower where the engine hears nobody speak. An engine without a network has one sound for both. Events do
-        not depend on it, and turns are for a recogniser.
+        not depend on it, and turns always hold the sound for a recogniser.
 
     Attributes
     ----------

@@ -67,20 +67,31 @@ def run(tmp_path_factory):
 
 @pytest.mark.slow
 def test_networks_are_compared_by_words_with_a_profile_and_without_against_ss(tmp_path, run, conversation, whisper):
-    arguments = ["--networks", run / "last.onnx", "--conversations", conversation, "--cold", "--whisper", whisper]
+    arguments = [
+        "--networks",
+        run / "last.onnx",
+        "--conversations",
+        conversation,
+        "--cold",
+        "--silent",
+        "--whisper",
+        whisper,
+    ]
     arguments += ["--output", tmp_path / "results" / "training", "--cache", tmp_path / "cache"]
     assert program.main(["training", "words", *map(str, arguments)]) == 0
     part = results.read(tmp_path / "results" / "training.json")["parts"]["words"]
     found = rows_of(part["rows"])
     tiny = "tiny/last"
     mixed = [name + share for name in ("ss", "crnn", tiny, f"{tiny}, 0.5 ss") for share in ("", ", 0.2 error")]
-    assert [row["system"] for row in found] == 2 * ["linear", *mixed]
-    assert [row["kind"] for row in found] == 9 * ["conversations lab"] + 9 * ["conversations lab cold"]
+    assert [row["system"] for row in found] == 3 * ["linear", *mixed]
+    kinds = ("conversations lab", "conversations lab cold", "conversations lab robot silent")
+    assert [row["kind"] for row in found] == [kind for kind in kinds for _ in range(9)]
     assert all((row["errors"], row["deletions"], row["insertions"], row["words"]) == (1, 1, 0, 2) for row in found)
     by_name = {row["system"]: row["si_sdr"] for row in found[:9]}
     assert by_name["ss"] == pytest.approx(by_name[tiny], abs=0.1)  # after four steps it is still nearly 'ss'
     assert by_name["crnn"] != by_name[tiny]
     assert all(by_name[name] != by_name[f"{name}, 0.2 error"] for name in ("crnn", tiny))  # the share is another answer
+    assert found[18]["si_sdr"] > 15 > by_name["linear"]  # the fan alone, 20 dB below the human
     assert "| tiny/last | 50 | 50 | 0 | 0.0 |" in (tmp_path / "results" / "training.md").read_text()
 
 
