@@ -118,7 +118,7 @@ class Crnn:
         mic, reference = mic.after(heard), reference.after(_power(frame.reference))
         scale = mic.factor(LOUD[0])
         places = self._run(frame, tensors, scale, reference.factor(LOUD[1]))
-        sounds: Spectrum = places.sounds * np.float32(1.0 / scale)
+        sounds: Spectrum = places.sounds[: 1 + frame.idle] * np.float32(1.0 / scale)
         if self._ss_helps:
             masked, mask = self._ss.step(frame, mask)
             sounds = (1 - SHARE_OF_SS) * sounds + SHARE_OF_SS * masked.spectrum
@@ -131,7 +131,7 @@ class Crnn:
         following = tuple(place.copy() for place in places.next_states)
         speaks = 0.0 if powers[0] < FAINT * mic.loudest else min(max(places.probability.item(), 0.0), 1.0)
         listen, *recognise = gain * sounds
-        return Output(listen, speaks, *(recognise if frame.idle else ())), (following, mask, (mic, reference))
+        return Output(listen, speaks, *recognise), (following, mask, (mic, reference))
 
     def _run(self, frame: Frame, state: tuple[Samples, ...], mic: np.float32, reference: np.float32) -> Places:
         """Run the network on a frame whose microphone and reference are scaled by these factors; its answers are in what is returned."""

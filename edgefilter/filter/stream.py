@@ -230,13 +230,13 @@ class Stream:
             self._collect(frame, engine)
             return NOTHING
         output, self._state = step(engine, frame, self._state)
+        sounds = output.sounds
         if output.speech_probability is not None:
-            self._turns.step(output.sounds[0], frame.error, self.front.errors)
+            self._turns.step(sounds[0], frame.error, self.front.errors)
         said = output.speech_probability
         human = None if said is None else human_probability(said)
         self._judge_speech(human, frame, aligned)
         self.front.hear(frame, output, self.speech_probability, self.barge_in.speaking)
-        sounds = output.sounds
         if human is not None and not self.barge_in.speaking:
             sounds[1] *= np.float32(NOBODY ** (1.0 - human))
         return self._synthesiser.push(sounds)
