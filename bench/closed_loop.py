@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import soundfile
 
+from bench.simulate.microphones import Processing, Stream
 from edgefilter import EgoFilter, Event, Profile
 from edgefilter.closed_loop import closed_loop
 from edgefilter.filter.barge_in import BargeInSettings
@@ -30,14 +31,30 @@ class Output(NamedTuple):
 class Robot(NamedTuple):
     """A robot that lowers its voice by ask_db when the filter asks for it.
 
-    echo: (n,), its voice as the microphone recorded it; late: delay of the echo behind the reference, samples. file: where to
-    write what it plays (left) and what its microphone hears (right).
+    echo: (n,), its voice as the microphone recorded it, or `softened`; late: delay of the echo behind the reference, samples.
+    file: where to write what it plays (left) and what its microphone hears (right). device: what processes the microphone's sound.
     """
 
     echo: Samples
     late: int
     ask_db: float
     file: Path | None = None
+    device: Processing | None = None
+
+
+class Behind:
+    """A filter behind a device that processes what the microphone hears."""
+
+    def __init__(self, ego: EgoFilter, device: Processing) -> None:
+        self._ego, self._device = ego, Stream(device)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._ego, name)
+
+    def process(self, mic: Samples, ref: Samples) -> Samples:
+        """As of the filter, and mic (n,) holds afterwards what the device made of it."""
+        mic[:] = np.clip(self._device(mic)[0], -1.0, 1.0)
+        return self._ego.process(mic, ref)
 
 
 def listen(
@@ -46,7 +63,8 @@ def listen(
     """Run the filter over mic (n,) or (n, microphones) and ref (n,); more: further arguments of EgoFilter."""
     mic, ref = np.array(mic, np.float32), np.array(ref, np.float32)
     robot = robot or Robot(np.zeros_like(mic), 0, 0.0)
-    ego = EgoFilter(profile, engine=engine, barge_in=BargeInSettings(ask_db=robot.ask_db), **more)
+    ego: Any = EgoFilter(profile, engine=engine, barge_in=BargeInSettings(ask_db=robot.ask_db), **more)
+    ego = Behind(ego, robot.device) if robot.device else ego
     done, probability = [], []
     for out in closed_loop(ego, mic, ref, robot.echo, robot.late):
         done.append(out)

@@ -15,6 +15,7 @@ import argparse
 from pathlib import Path
 
 from bench.live import barge_in, soak
+from bench.simulate.microphones import MICROPHONES
 from edgefilter.errors import UsageError
 
 PARTS = {"barge-in": barge_in.run, "soak": soak.run, "hour": soak.run}
@@ -36,6 +37,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=0.0,
         metavar="DB",
         help="barge-in: by how much a robot lowers its voice that is asked to",
+    )
+    add(
+        "--microphone",
+        choices=tuple(MICROPHONES),
+        help="barge-in: what else it does or hears, see bench/simulate/microphones.py",
     )
     add("--sound", type=Path, metavar="DIR", help="barge-in: folder for WAV files of what robots play and hear")
     add("--real", type=Path, metavar="DIR", help="barge-in: recordings of a real loudspeaker alone")

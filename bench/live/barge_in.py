@@ -11,7 +11,8 @@ Backchannels: the same scenes, with a short word or a cough in the place of the 
 alone for --minutes of its speech (--alone: its voices), in new rooms all the time, half of them with loudspeakers of
 strong distortion and half without a calibration, and recordings of a real loudspeaker (--real) that nothing was tuned
 on, lowered as a whole where the robot asks. --ask-db: interruptions and false stops with a robot that lowers its voice
-where the filter asks for it; --sound: what each of them plays that is interrupted and calibrated, on the left, and what
+where the filter asks for it; a simulated loudspeaker then distorts less, and a microphone that processes its sound
+(--microphone) does so with what it hears by then. --sound: what each of them plays that is interrupted and calibrated, on the left, and what
 its microphone hears. Rows are kept in --cache as they are made: a run that was cut off, or is asked for more minutes,
 goes on there.
 """
@@ -21,8 +22,9 @@ from __future__ import annotations
 import argparse
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
 
@@ -49,13 +51,16 @@ from bench.metrics import (
 from bench.recogniser import Recogniser, normalise, word_errors
 from bench.recordings import CALIBRATION, find_recordings, progress
 from bench.simulate.conversations import Scene, make_scene, read_clips, read_voices
+from bench.simulate.microphones import Processing
 from bench.simulate.monologues import STARTS, Monologue, make_monologue
+from bench.simulate.simulated_robot import softened
 from edgefilter.calibration.calibrate import calibrate
 from edgefilter.filter.barge_in import BargeIn, BargeInSettings
-from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE, Samples
 
 KINDS = ("paper", "live")
+Hear = Callable[..., Output]
+"""`listen` to what a scene's microphone and reference are, with an engine, behind the scene's device."""
 REACTION_S, FADE_S = 0.05, 0.02
 """From the event until the robot's player is told, and how long its fade takes."""
 DUCK_DB = -10.0
@@ -84,20 +89,28 @@ POLICIES = {
 SHORT = {"word": "a word of 0.3-0.5 s", "cough": "a cough"}
 
 
-def measure(scene: Scene, engine: str, recogniser: Recogniser | None, ask_db: float, file: Path | None = None) -> dict:
-    """Ready for JSON: noticed with a calibration and without, words under each policy, backchannels."""
+def measure(
+    scene: Scene, engine: str, recogniser: Recogniser | None, ask_db: float, file: Path | None = None,
+    device: Processing | None = None,
+) -> dict:  # fmt: skip
+    """Ready for JSON: noticed with a calibration and without, words under each policy, backchannels. device: behind the scene's microphone."""
     signals, meta = scene.signals, scene.meta
     ref, onset = signals["ref"], first_sound(signals["clean"].astype(np.float32))
-    profile = calibrate(*(signals[name].astype(np.float32) for name in CALIBRATION))
+    sweep, *recorded = (signals[name] for name in CALIBRATION)
+    recorded = [device.whole(x)[0] for x in recorded] if device else recorded
+    profile = calibrate(*(x.astype(np.float32) for x in (sweep, *recorded)))
     late = meta.get("lag2", meta["lag"]) + meta["delay"]  # of the second utterance, which is interrupted
-    robot = Robot(scene.echo(ref).astype(np.float32), late, ask_db)
-    talk = listen(signals["mic"], ref, profile, engine, robot._replace(file=file))
+    softer = scene.echo(10 ** (-ask_db / 20) * ref) if ask_db else None
+    robot = Robot(softened(scene.echo(ref), softer, ask_db), late, ask_db, device=device)
+    silent = robot._replace(echo=np.zeros_like(robot.echo), ask_db=0.0)
+    hear = partial(listen, profile=profile, engine=engine, robot=silent)
+    talk = hear(signals["mic"], ref, robot=robot._replace(file=file))
     row = {name: meta[name] for name in ("room", "voice", "speaker", "text", "sisdr_mix")}
     row["calibrated"] = when(talk, onset)
-    row["cold"] = when(listen(signals["mic"], ref, None, engine, robot), onset)
-    row["short"] = {kind: when(backchannel(scene, kind, profile, engine, onset), onset) for kind in SHORT}
+    row["cold"] = when(hear(signals["mic"], ref, profile=None, robot=robot), onset)
+    row["short"] = {kind: when(backchannel(scene, kind, hear, onset), onset) for kind in SHORT}
     if recogniser:
-        row["words"] = policies(scene, talk, profile, engine, onset, recogniser)
+        row["words"] = policies(scene, talk, hear, onset, recogniser)
     return row
 
 
@@ -122,7 +135,7 @@ def lasts(talk: Output, onset: int) -> list[bool] | None:
     return [all(speaking[begun : begun + n + 1]) for n in hops]
 
 
-def backchannel(scene: Scene, kind: str, profile: Profile, engine: str, onset: int) -> Output:
+def backchannel(scene: Scene, kind: str, hear: Hear, onset: int) -> Output:
     """The filter over the scene with the human's first syllables alone, or with noise that bursts and dies away."""
     rng = np.random.default_rng(scene.meta["seed"])
     clean = scene.signals["clean"]
@@ -138,12 +151,10 @@ def backchannel(scene: Scene, kind: str, profile: Profile, engine: str, onset: i
         sound *= level * 10 ** (COUGH_DB / 20) / np.sqrt(np.mean(sound**2))
     mic = scene.signals["mic"] - clean
     mic[onset : onset + n] += sound[: clean.size - onset]
-    return listen(mic, scene.signals["ref"], profile, engine)
+    return hear(mic, scene.signals["ref"])
 
 
-def policies(
-    scene: Scene, talk: Output, profile: Profile, engine: str, onset: int, recogniser: Recogniser
-) -> dict[str, dict]:
+def policies(scene: Scene, talk: Output, hear: Hear, onset: int, recogniser: Recogniser) -> dict[str, dict]:
     """Words under each policy; with an event the recording is made anew from there on."""
     start = next((e.sample for e in talk.events if e.kind == "speech_started"), None)
     after = None if start is None else start + round(REACTION_S * SAMPLE_RATE)
@@ -151,7 +162,7 @@ def policies(
     outs = {"open": talk.samples, "muted": muted(scene)}
     for name, (at, gain) in turned.items():
         ref = scene.signals["ref"] if at is None else lowered(scene.signals["ref"], at, gain)
-        outs[name] = talk.samples if at is None else listen(scene.mic(ref), ref, profile, engine).samples
+        outs[name] = talk.samples if at is None else hear(scene.mic(ref), ref).samples
     outs["alone"] = scene.signals["clean"].astype(np.float32)
     span = slice(scene.meta["start"], scene.meta["end"])
     share = SAMPLE_RATE / (span.stop - span.start)
@@ -209,8 +220,8 @@ def early_errors(spoken: Sequence[str], recognised: Sequence[str], first: int) -
 
 
 def monologues(
-    folders: list[Path], minutes: float, seed: int, engine: str, ask_db: float, kept: Cache, of: object
-) -> list[dict]:
+    folders: list[Path], minutes: float, seed: int, engine: str, ask_db: float, microphone: str | None, kept: Cache, of: object
+) -> list[dict]:  # fmt: skip
     """A row for each robot, until they have spoken for so many minutes; each voice goes on where it stopped."""
     voices = read_voices(folders) if folders else {}
     order = np.random.default_rng(seed)
@@ -222,7 +233,7 @@ def monologues(
         own = islice(cycle(clips[voice]), taken[voice], None)
 
         def made(index: int = index, voice: str = voice, own: object = own) -> dict:
-            return monologue(make_monologue(seed, index, voice, own, length), engine, ask_db)
+            return monologue(make_monologue(seed, index, voice, own, length, ask_db, microphone), engine, ask_db)
 
         rows.append(kept.get(made, of, "robot alone", index, length))
         taken[voice] += len(rows[-1]["said"])
@@ -231,7 +242,7 @@ def monologues(
 
 def monologue(made: Monologue, engine: str, ask_db: float) -> dict:
     profile = calibrate(*made.calibration) if made.start == "calibrated" else None
-    talk = listen(made.mic, made.ref, profile, engine, Robot(made.echo, made.late, ask_db))
+    talk = listen(made.mic, made.ref, profile, engine, Robot(made.echo, made.late, ask_db, device=made.device))
     said = [[f"{clip.path.parent.name}/{clip.path.stem}", seconds] for clip, seconds in made.said]
     of = {key: getattr(made, key) for key in ("room", "distortion", "start", "voice")}
     return of | {"said": said} | stops(talk, sum(seconds for _, seconds in said))
@@ -274,14 +285,9 @@ def run(options: argparse.Namespace) -> str:
     recogniser = Recogniser(options.whisper, Cache(options.cache)) if options.whisper else None
     kept = Cache(options.cache, "barge_in")
     sources = [entry["sha256"] for entry in made_with["data"]]
-    of = (
-        engine,
-        options.ask_db,
-        options.seed,
-        made_with["judged"],
-        sources,
-        recogniser.identity if recogniser else None,
-    )
+    microphone = options.microphone
+    of = (engine, options.ask_db, microphone, options.seed, made_with["judged"], sources,
+          recogniser.identity if recogniser else None)  # fmt: skip
     speech, voices = read_clips(options.speech, (3.0, 12.0)), read_voices(options.voices)
     rows = []
     if options.sound:
@@ -289,11 +295,15 @@ def run(options: argparse.Namespace) -> str:
     for index in progress(range(options.count), "conversation"):
 
         def made(index: int = index) -> dict:
-            scene = make_scene(options.seed, index, KINDS[index // 2 % 2], speech, voices)
-            return measure(scene, engine, recogniser, options.ask_db, options.sound and options.sound / f"{index}.wav")
+            beside = None if microphone == "processed" else microphone
+            scene = make_scene(options.seed, index, KINDS[index // 2 % 2], speech, voices, microphone=beside)
+            drawn, mic = np.random.default_rng([options.seed, index, 1]), scene.signals["mic"]
+            device = None if microphone == beside else Processing.draw(drawn, mic)
+            file = options.sound and options.sound / f"{index}.wav"
+            return measure(scene, engine, recogniser, options.ask_db, file, device)
 
         rows.append(kept.get(made, of, "conversation", index))
-    alone = monologues(options.alone, options.minutes, options.seed, engine, options.ask_db, kept, of)
+    alone = monologues(options.alone, options.minutes, options.seed, engine, options.ask_db, microphone, kept, of)
     alone += real_minutes(options.real, engine, options.ask_db) if options.real else []
     points = {start: curve([row[start] for row in rows], alone, start) for start in STARTS}
     lines = {start: ([p["per_hour"] for p in of], [100 * p["in_time"] for p in of]) for start, of in points.items()}
@@ -302,9 +312,11 @@ def run(options: argparse.Namespace) -> str:
     notes = f"Engine `{engine}`, default threshold. Humans 20-28 dB below the robot that talks meanwhile."
     if options.ask_db:
         notes += f" The robot asks: it lowers its voice by {options.ask_db:g} dB, and a recorded one all that its recording holds."
+    part = "_".join(("barge_in", *filter(None, [microphone])))
+    title = "Barge-in in closed loop" + (f", microphone: {microphone}" if microphone else "")
     return results.write(
-        options.output, "barge_in", "Barge-in in closed loop", made_with, tables(rows, alone, points),
-        [results.plot("barge_in", [panel])], notes, engine=engine, conversations=rows, alone=alone, curve=points,
+        options.output, part, title, made_with, tables(rows, alone, points),
+        [results.plot(part, [panel])], notes, engine=engine, conversations=rows, alone=alone, curve=points,
     )  # fmt: skip
 
 

@@ -8,17 +8,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import signal
-from scipy.ndimage import minimum_filter1d
 
 from bench.simulate.simulated_robot import RATE, Array, Rng
 
-FRAME = RATE // 100
-"""10 ms, of gains."""
+FRAME = 128
+"""8 ms, of gains."""
 EDGES_HZ = (250, 500, 1000, 2000, 3000, 4500, 6000)
 """Between the bands of the noise suppression, about two critical bands each."""
+TAPS = 255
+LATE = TAPS // 2
+"""Samples by which a device that processes is late: the delay of its filters."""
 FLOOR_S = 1.5
 """The noise is the least of a band's power over this: longer than a word."""
 RECORDED = ("sweep_mic", "fan_only", "mic")
@@ -27,45 +30,85 @@ RECORDED = ("sweep_mic", "fan_only", "mic")
 Signals = dict[str, Array]
 
 
+@dataclass(frozen=True)
+class Processing:
+    """A device that suppresses noise and controls its gain.
+
+    depth_db: by how much it lowers noise at most. ratio: decibels by which it turns down what is a decibel louder than mean_db.
+    """
+
+    depth_db: float
+    ratio: float
+    mean_db: float
+
+    @classmethod
+    def draw(cls, rng: Rng, mic: Array) -> Processing:
+        return cls(rng.uniform(8, 15), rng.uniform(0.4, 0.8), 10 * math.log10(np.mean(np.square(mic, dtype=float))))
+
+    def whole(self, mic: Array, *parts: Array) -> list[Array]:
+        """What a device that is switched on makes of a recording (n,), not late, and of its parts under the same gains."""
+        sounds = [np.pad(x, (0, LATE)) for x in (mic, *parts)]
+        return [x[LATE:] for x in Stream(self)(*sounds)]
+
+
+class Stream:
+    """One run of such a device, block by block: one gain of each band against noise, and one of all against the level."""
+
+    def __init__(self, device: Processing) -> None:
+        self._device = device
+        lows = [np.zeros(TAPS), *(signal.firwin(TAPS, hz, fs=RATE) for hz in EDGES_HZ), np.eye(1, TAPS, LATE)[0]]
+        self._bands = np.diff(lows, axis=0)
+        self._before: Array = np.zeros(0)
+        self._power = self._level = self._suppressed = self._gain = self._floor = np.zeros(0)
+
+    def __call__(self, mic: Array, *parts: Array) -> list[Array]:
+        """The sound (n,) that comes out, LATE, and its parts; n is a multiple of FRAME but for the last block."""
+        sounds = np.stack([np.pad(x.astype(float), (0, -x.size % FRAME)) for x in (mic, *parts)])
+        if not self._before.size:
+            self._before = np.zeros((len(sounds), TAPS - 1))
+        sounds = np.concatenate((self._before, sounds), axis=1)
+        self._before = sounds[:, 1 - TAPS :]
+        bands = signal.oaconvolve(sounds[:, None], self._bands[None], "valid", axes=2)  # (parts, bands, n)
+        self._power, power = _smooth(_power(bands[0]), 0.03, self._power)
+        frames = round(FLOOR_S * RATE / FRAME) - 1
+        past = np.concatenate(
+            (self._floor if self._floor.size else np.repeat(power[:, :1], frames, axis=1), power), axis=1
+        )
+        self._floor = past[:, -frames:]
+        noise = 1.5 * np.lib.stride_tricks.sliding_window_view(past, frames + 1, axis=1).min(axis=2)
+        suppression = np.sqrt(np.maximum(1 - noise / power, 10 ** (-self._device.depth_db / 10)))
+        self._suppressed, suppression = _smooth(suppression, 0.01, self._suppressed)
+        self._level, level = _smooth(_power(sounds[:1, TAPS - 1 :]), 0.1, self._level)
+        above_db = 10 * np.log10(level) - self._device.mean_db
+        gains = suppression * 10 ** (np.clip(-self._device.ratio * above_db, -9, 3) / 20)
+        gains = np.concatenate((self._gain if self._gain.size else gains[:, :1], gains), axis=1)
+        self._gain = gains[:, -1:]
+        at = np.arange(bands.shape[2]) / FRAME
+        each = np.stack([np.interp(at, np.arange(band.size), band) for band in gains])
+        return [np.sum(each * one, axis=0)[: mic.size] for one in bands]
+
+
 def processed(rng: Rng, signals: Signals, voice: Array) -> Signals:
-    """A device that suppresses noise and controls its gain; the human is what it makes of the human."""
-    depth_db, ratio = rng.uniform(8, 15), rng.uniform(0.4, 0.8)
-    mean_db = 10 * math.log10(np.mean(signals["mic"] ** 2))
-    found = {name: _processed(depth_db, ratio, mean_db, signals[name])[0] for name in ("sweep_mic", "fan_only")}
-    heard = _processed(depth_db, ratio, mean_db, *(signals[name] for name in ("mic", "clean", "fan")))
+    """A device that processes what it hears; the human is what it makes of the human."""
+    device = Processing.draw(rng, signals["mic"])
+    found = {name: device.whole(signals[name])[0] for name in ("sweep_mic", "fan_only")}
+    heard = device.whole(*(signals[name] for name in ("mic", "clean", "fan")))
     found |= dict(zip(("mic", "clean", "fan"), heard, strict=True))
     full = max(1.0, max(np.abs(x).max() for x in found.values()) / 0.95)
     return signals | {name: x / full for name, x in found.items()}
 
 
-def _processed(depth_db: float, ratio: float, mean_db: float, mic: Array, *parts: Array) -> list[Array]:
-    """The microphone and its parts, (n,) each, under the same gains: one of each band against noise, and one of all against the level."""
-    lows = [np.zeros(255), *(signal.firwin(255, hz, fs=RATE) for hz in EDGES_HZ), np.eye(1, 255, 127)[0]]
-    out = [np.zeros(mic.size) for _ in (mic, *parts)]
-    for taps in np.diff(lows, axis=0):
-        power = _smooth(_power(signal.oaconvolve(mic, taps, "same")), 0.03)
-        frames = round(FLOOR_S * RATE / FRAME)
-        noise = 1.5 * minimum_filter1d(power, frames, origin=(frames - 1) // 2)
-        gain = _smooth(np.sqrt(np.maximum(1 - noise / power, 10 ** (-depth_db / 10))), 0.01)
-        for x, whole in zip((mic, *parts), out, strict=True):
-            whole += _each_sample(gain, mic.size) * signal.oaconvolve(x, taps, "same")
-    above_db = 10 * np.log10(_smooth(_power(mic), 0.1)) - mean_db
-    control = _each_sample(10 ** (np.clip(-ratio * above_db, -9, 3) / 20), mic.size)
-    return [control * whole for whole in out]
-
-
 def _power(x: Array) -> Array:
-    """Mean square of each frame of x (n,), the last one filled up, (frames,)."""
-    return np.mean(np.pad(x, (0, -x.size % FRAME)).reshape(-1, FRAME) ** 2, axis=1) + 1e-12
+    """Mean square of each frame of x (..., n), (..., frames)."""
+    return np.mean(x.reshape(*x.shape[:-1], -1, FRAME) ** 2, axis=-1) + 1e-12
 
 
-def _smooth(values: Array, seconds: float) -> Array:
+def _smooth(values: Array, seconds: float, before: Array) -> tuple[Array, Array]:
+    """Values (rows, frames) behind those that ended in `before` (rows, 1), or in none yet (0,): the last one, and all of them."""
     kept = math.exp(-FRAME / RATE / seconds)
-    return signal.lfilter([1 - kept], [1, -kept], values, zi=[kept * values[0]])[0]
-
-
-def _each_sample(gains: Array, n: int) -> Array:
-    return np.interp(np.arange(n), FRAME * (np.arange(gains.size) + 0.5), gains)
+    start = kept * (before if before.size else values[:, :1])
+    found = signal.lfilter([1 - kept], [1, -kept], values, axis=1, zi=start)[0]
+    return found[:, -1:], found
 
 
 def hum(rng: Rng, signals: Signals, voice: Array) -> Signals:
@@ -83,7 +126,8 @@ def hum(rng: Rng, signals: Signals, voice: Array) -> Signals:
 def motors(rng: Rng, signals: Signals, voice: Array) -> Signals:
     """Servos that make gestures while the voice (n,) sounds, 14 to 28 dB below it where they move: as loud as the human, or twice."""
     speed, at = np.zeros(voice.size), 0
-    loud = _each_sample(_smooth(_power(voice), 0.1), voice.size)
+    _, power = _smooth(_power(np.pad(voice, (0, -voice.size % FRAME))[None]), 0.1, np.zeros(0))
+    loud = np.interp(np.arange(voice.size), FRAME * (np.arange(power.size) + 0.5), power[0])
     while at < voice.size:
         size = int(rng.uniform(0.2, 0.8) * RATE)
         if loud[at] > 1e-2 * loud.max():

@@ -11,6 +11,7 @@ import numpy as np
 
 from bench.simulate import simulated_robot as physics
 from bench.simulate.conversations import DISTORTION_DB, Clip, read_speech
+from bench.simulate.microphones import MICROPHONES, RECORDED, Processing
 from bench.simulate.simulated_robot import RATE, Array, Rng, Robot, Room
 from edgefilter.types import Samples
 
@@ -41,38 +42,45 @@ class Repertoire(Iterator[Array]):
 
 def speak(
     rng: Rng, robot: Robot, repertoire: Iterator[Array], speech_s: float, room: Room, lag: int, volume_db: float = 0.0,
-    ppm: float = 0.0,
-) -> tuple[Array, Array, list[slice]]:  # fmt: skip
-    """Make speech_s seconds of speech: the reference (n,), its echo (n,) before the microphone's gain, and where in the echo each utterance lies."""
+    ppm: float = 0.0, ask_db: float = 0.0,
+) -> tuple[Array, Array, Array, list[slice]]:  # fmt: skip
+    """Make speech_s seconds of speech: the reference, its echo, that of the voice lowered by ask_db, (n,) each, and where each utterance lies.
+
+    The echoes are those before the microphone's gain.
+    """
     said: list[tuple[int, Array]] = []
     at, missing = RATE // 2, speech_s * RATE
     while missing > 0:
         said.append((at, next(repertoire)))
         missing -= said[-1][1].size
         at += said[-1][1].size + int(rng.uniform(*PAUSE_S) * RATE)
-    ref, echo = np.zeros((2, at + lag + int(END_S * RATE)))
+    ref, *echoes = np.zeros((3, at + lag + int(END_S * RATE)))
     tail = room.robot.size + robot.bulk
     for start, samples in said:
         ref[start : start + samples.size] = samples
-        heard = robot.record(np.pad(10 ** (volume_db / 20) * samples, (0, tail)), room.robot)
-        place = echo[start + lag : start + lag + heard.size]
-        place += heard[: place.size]
+        for echo, lower_db in zip(echoes, (0.0, ask_db) if ask_db else (0.0,)):
+            heard = robot.record(np.pad(10 ** ((volume_db - lower_db) / 20) * samples, (0, tail)), room.robot)
+            place = echo[start + lag : start + lag + heard.size]
+            place += heard[: place.size]
     later = lag + robot.bulk
-    return ref, physics.warp(echo, ppm), [slice(start + later, start + later + x.size) for start, x in said]
+    echo, softer = (physics.warp(one, ppm) for one in echoes)
+    return ref, echo, softer, [slice(start + later, start + later + x.size) for start, x in said]
 
 
 @dataclass(frozen=True)
 class Monologue:
     """One robot in one room, from the filter's first moment on.
 
-    ref, mic: reference and microphone, (n,) float32. echo: the robot's part of mic. late: samples by which the echo comes
-    after the reference. start: "calibrated" where the filter gets the calibration (sweep, its recording, the fan's noise),
-    "cold" where it does not. said: the clips in order, with their durations in seconds.
+    ref, mic: reference and microphone, (n,) float32. echo: the robot's part of mic, or `softened`. late: samples by which the
+    echo comes after the reference. device: what processes what the microphone hears; it has processed the calibration. start:
+    "calibrated" where the filter gets the calibration (sweep, its recording, the fan's noise), "cold" where it does not.
+    said: the clips in order, with their durations in seconds.
     """
 
     ref: Samples
     mic: Samples
     echo: Samples
+    device: Processing | None
     late: int
     calibration: tuple[Samples, Samples, Samples]
     room: str
@@ -82,8 +90,10 @@ class Monologue:
     said: list[tuple[Clip, float]]
 
 
-def make_monologue(seed: int, index: int, voice: str, clips: Iterator[Clip], speech_s: float) -> Monologue:
-    """Simulate monologue number `index` of this seed.
+def make_monologue(
+    seed: int, index: int, voice: str, clips: Iterator[Clip], speech_s: float, ask_db: float = 0.0, microphone: str | None = None
+) -> Monologue:  # fmt: skip
+    """Simulate monologue number `index` of this seed, ask_db: of a robot that lowers its voice. Whatever the microphone, all else of it is the same.
 
     The index decides kind of room, distortion and start, each in turn, and whether the clocks differ, for eight monologues
     yes and for eight no. The microphone's gain is the largest at which neither a sweep in that room has a peak above 0.3 of
@@ -99,7 +109,7 @@ def make_monologue(seed: int, index: int, voice: str, clips: Iterator[Clip], spe
     ppm = rng.choice([-1.0, 1.0]) * math.exp(rng.uniform(*np.log(PPM))) if index // 8 % 2 else 0.0
     lag, volume_db = round(rng.uniform(*LAG_S) * RATE), rng.uniform(-3, 3)
     said = Repertoire(chain([first], clips))
-    ref, echo, heard = speak(rng, robot, said, speech_s, room, lag, volume_db, ppm)
+    ref, echo, softer, heard = speak(rng, robot, said, speech_s, room, lag, volume_db, ppm, ask_db)
     excitation = physics.sweep()
     swept = robot.record(excitation, room.robot)
     gain = float(min(0.3 / np.abs(swept).max(), 0.8 / float(np.abs(echo).max())))
@@ -108,7 +118,15 @@ def make_monologue(seed: int, index: int, voice: str, clips: Iterator[Clip], spe
     beside, with_sweep, alone = (
         (fan * physics.fan_noise(rng, spectrum, size)).astype(np.float32) for size in (ref.size, swept.size, 8 * RATE)
     )
-    voiced = (gain * echo).astype(np.float32)
-    sweeps = excitation.astype(np.float32), np.float32(gain) * swept.astype(np.float32) + with_sweep, alone
-    return Monologue(ref.astype(np.float32), voiced + beside, voiced, lag + robot.bulk, sweeps, kind, distortion, start,
-                     voice, said.said)  # fmt: skip
+    swept, late = np.float32(gain) * swept.astype(np.float32) + with_sweep, lag + robot.bulk
+    signals = {"sweep_mic": swept, "fan_only": alone, "mic": (gain * echo).astype(np.float32) + beside, "fan": beside}
+    signals["clean"] = np.zeros_like(beside)
+    drawn, device = np.random.default_rng([seed, index, 1]), None
+    if microphone == "processed":
+        device = Processing.draw(drawn, signals["mic"])
+        signals |= {name: device.whole(signals[name])[0] for name in ("sweep_mic", "fan_only")}
+    elif microphone:
+        signals = MICROPHONES[microphone](drawn, signals, np.pad(ref, (late, 0))[: ref.size])
+    sweep_mic, fan_only, mic = (signals[name].astype(np.float32) for name in RECORDED)
+    return Monologue(ref.astype(np.float32), mic, gain * physics.softened(echo, softer, ask_db), device, late,
+                     (excitation.astype(np.float32), sweep_mic, fan_only), kind, distortion, start, voice, said.said)  # fmt: skip

@@ -275,3 +275,9 @@ def with_distortion(robot: Robot, played: Array, response: Array, nl_db: float) 
         found = -si_sdr(robot.record(played, response), straight)
         low, high = (middle, high) if found < nl_db else (low, middle)
     return robot, found
+
+
+def softened(echo: Array, softer: Array, ask_db: float) -> Array:
+    """The echo (n,) that a linear loudspeaker would have if it lost as much from there to `softer`, the same voice lowered by ask_db, (n,)."""
+    lower = 10 ** (-ask_db / 20)
+    return ((echo - softer) / (1 - lower) if ask_db else echo).astype(np.float32)

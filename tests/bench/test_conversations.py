@@ -145,12 +145,21 @@ def test_a_processed_microphone_lowers_the_fan_and_changes_the_human_with_all_an
     before = pause & (np.arange(voice.size) < voice.size // 2) & (np.arange(voice.size) > RATE)
     lowered = np.mean(found["mic"][before] ** 2) / np.mean(signals["mic"][before] ** 2)
     assert 10 * np.log10(lowered) < -3  # 8 to 15 dB of suppression, 3 of which the gain gives back
-    parts = microphones._processed(10.0, 0.5, -20.0, signals["mic"], voice, signals["clean"], signals["fan"])
+    device = microphones.Processing(10.0, 0.5, -20.0)
+    parts = device.whole(signals["mic"], voice, signals["clean"], signals["fan"])
     np.testing.assert_allclose(parts[0], sum(parts[1:]), atol=1e-9)
     spectra, after = (np.fft.rfft(x.reshape(-1, 800)) for x in (signals["mic"], found["mic"]))
     left = after - spectra * np.sum(after * spectra.conj(), 0) / np.sum(np.abs(spectra) ** 2, 0)
     assert np.sum(np.abs(left) ** 2) > 0.01 * np.sum(np.abs(after) ** 2)  # -20 dB, as loud as the human
     assert np.array_equal(found["sweep_ref"], voice) and not found["clean"][:RATE].any()
+
+
+def test_a_device_makes_of_blocks_what_it_makes_of_a_whole_recording_and_is_late_by_its_filters() -> None:
+    signals, _ = scene_signals()
+    mic, device = signals["mic"][:50_000], microphones.Processing(10.0, 0.5, -20.0)  # the last block is cut
+    stream, late = microphones.Stream(device), microphones.LATE
+    blocks = np.concatenate([stream(mic[at : at + 256])[0] for at in range(0, mic.size, 256)])
+    np.testing.assert_allclose(blocks[late:], device.whole(mic)[0][:-late], atol=1e-9)
 
 
 def test_a_microphone_that_hums_does_so_in_the_calibration_and_the_human_does_not() -> None:

@@ -19,7 +19,7 @@ from bench.live import barge_in, soak, virtual_sound
 from bench.live.barge_in import early_errors, lasts, lowered, muted, silent_at, words
 from bench.metrics import first_sound
 from bench.recogniser import Recogniser
-from bench.simulate import monologues
+from bench.simulate import microphones, monologues
 from bench.simulate.conversations import Scene, make_scene, read_clips, read_voices
 from bench.simulate.simulated_robot import Room, draw_robot, draw_walls, stand
 from edgefilter import Event
@@ -218,7 +218,7 @@ def test_interruptions_and_false_stops_from_end_to_end(
 ) -> None:
     asked = []
 
-    def listen(mic: np.ndarray, ref: np.ndarray, profile: object, engine: str, robot: object = None) -> Output:
+    def listen(mic: np.ndarray, ref: np.ndarray, profile: object, engine: str, robot: object) -> Output:
         """A filter that notices the human after 0.1 s if the robot is as loud as ever, and passes the microphone."""
         asked.append(ref)
         onset = first_sound(scene.signals["clean"].astype(np.float32)) + RATE // 10
@@ -236,7 +236,7 @@ def test_interruptions_and_false_stops_from_end_to_end(
             return "some words here" if np.abs(samples).max() > 0 else ""
 
     monkeypatch.setattr(barge_in, "Recogniser", Listener)
-    monkeypatch.setattr(barge_in, "make_scene", lambda *of: scene)
+    monkeypatch.setattr(barge_in, "make_scene", lambda *of, **more: scene)
     monkeypatch.setattr(barge_in, "listen", listen)
     options = ["--voices", clips, "--speech", clips, "--count", 1, "--alone", clips, "--minutes", 0.05]
     options += ["--whisper", clips, "--cache", tmp_path]
@@ -293,6 +293,51 @@ def test_a_robot_that_asks_is_heard_lower_as_late_as_its_sound_comes(
     lowered = np.flatnonzero(ref < 0.3)
     assert 10 * 256 < lowered[0] < 11 * 256 and 20 * 256 <= lowered[-1] < 21 * 256
     np.testing.assert_allclose(mic[late:], 0.5 + ref[:-late], atol=1e-6)
+
+
+def test_a_robot_that_asks_behind_a_device_is_heard_through_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    heard = []
+
+    class Filter:
+        hop, speech_probability, voice_gain = 256, 0.0, 1.0
+
+        def __init__(self, *of: object, **more: object) -> None: ...
+
+        def process(self, mic: np.ndarray, ref: np.ndarray) -> np.ndarray:
+            heard.append(mic.copy())
+            return mic
+
+        def events(self) -> list[Event]:
+            return []
+
+        def flush(self) -> np.ndarray:
+            return np.zeros(0, np.float32)
+
+    monkeypatch.setattr(closed_loop, "EgoFilter", Filter)
+    mic, device = babble(2.0, 3).astype(np.float32), microphones.Processing(10.0, 0.5, -30.0)
+    robot = closed_loop.Robot(np.zeros_like(mic), 0, 0.0, device=device)
+    out = closed_loop.listen(mic, mic, None, "crnn", robot)
+    expected = device.whole(mic)[0][: -microphones.LATE]
+    np.testing.assert_allclose(np.concatenate(heard)[microphones.LATE :], expected, atol=1e-6)
+    assert np.array_equal(out.samples, np.concatenate(heard)) and not np.allclose(
+        expected, mic[: expected.size], atol=1e-3
+    )
+
+
+@pytest.mark.slow
+def test_a_lowered_loudspeaker_distorts_less_and_a_monologue_says_so(clips: Path) -> None:
+    voices = read_voices([clips])
+    name = min(voices)
+    with driven():
+        plain, asked, processed = (
+            monologues.make_monologue(4, 2, name, iter(voices[name]), 2.0, *of)  # strong distortion
+            for of in ((), (12.0,), (0.0, "processed"))
+        )
+    assert np.array_equal(plain.mic, asked.mic) and np.array_equal(plain.mic, processed.mic)
+    left = plain.echo - 0.75 * asked.echo  # what is heard with the gain at 0.25
+    gain = float(left @ plain.echo / (plain.echo @ plain.echo))
+    assert 0.2 < gain < 0.4 and np.std(left - gain * plain.echo) > 0.01 * np.std(left)
+    assert plain.device is None and not np.allclose(processed.calibration[1], plain.calibration[1], atol=1e-4)
 
 
 def test_no_stop_in_half_an_hour_says_at_most_seven_an_hour() -> None:
