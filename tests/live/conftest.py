@@ -2,6 +2,7 @@
 and their monitors."""
 
 import os
+import subprocess
 from contextlib import ExitStack
 
 import pytest
@@ -30,3 +31,11 @@ def new_server(request):
 @pytest.fixture
 def server(new_server):
     return new_server()
+
+
+@pytest.fixture
+def loopback(server):
+    """The microphone hears what the output plays."""
+    words = ("source=robot.monitor", "sink=robot_mic", "latency_msec=60", "adjust_time=0")
+    subprocess.run(["pactl", "load-module", "module-loopback", *words], env=server.environment, check=True)
+    return server

@@ -24,7 +24,9 @@ def share(sound, whole):
     return np.mean([piece.astype("<i2").tobytes() in whole.tobytes() for piece in pieces])
 
 
-def test_the_played_speech_is_the_reference_and_ends_when_the_human_speaks(server, tmp_path):
+def test_the_played_speech_is_the_reference_is_lowered_to_hear_who_speaks_and_ends_when_the_human_does(
+    loopback, tmp_path
+):
     speech = soundfile.read(DEMO / "reference.flac", dtype="int16")[0][:48_000]
     robot = np.tile(speech, 3) | 1  # no sample is zero, so that silence is where nothing is played
     soundfile.write(tmp_path / "robot.wav", robot, 16_000, "PCM_16")
@@ -35,21 +37,21 @@ def test_the_played_speech_is_the_reference_and_ends_when_the_human_speaks(serve
     soundfile.write(tmp_path / "human.wav", human[begins - 4000 : begins + 24_000], 16_000, "PCM_16")
     loudspeaker = subprocess.Popen(
         ["parec", "-d", "robot.monitor", "--rate=16000", "--channels=1", "--format=s16le", "--latency-msec=50", "--raw", tmp_path / "heard.raw"],
-        env=server.environment,
+        env=loopback.environment,
     )  # fmt: skip
-    room = subprocess.Popen(["paplay", "-d", "robot_mic", tmp_path / "noise.wav"], env=server.environment)
+    room = subprocess.Popen(["paplay", "-d", "robot_mic", tmp_path / "noise.wav"], env=loopback.environment)
     live = subprocess.Popen(
         argv(
             "run", "--input", "mic", "--play", tmp_path / "robot.wav", "--barge-in", "stop", "--engine", "crnn",
-            "--no-learn", "--on-barge-in", f"echo $EDGEFILTER_TIME >> {tmp_path}/noticed", "--seconds", 6,
+            "--ask-db", 12, "--no-learn", "--on-barge-in", f"echo $EDGEFILTER_TIME >> {tmp_path}/noticed", "--seconds", 6,
             "--record", tmp_path / "heard", "--output", tmp_path / "out.wav",
         ),
-        env=server.environment, cwd=ROOT, stderr=subprocess.PIPE, text=True,
+        env=loopback.environment, cwd=ROOT, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     heard = tmp_path / "heard/mic.wav"
     while live.poll() is None and not (heard.exists() and heard.stat().st_size > 2 * 64_000):
         time.sleep(0.05)
-    subprocess.run(["paplay", "-d", "robot_mic", tmp_path / "human.wav"], env=server.environment, check=True)
+    subprocess.run(["paplay", "-d", "robot_mic", tmp_path / "human.wav"], env=loopback.environment, check=True)
     _, said = live.communicate(timeout=60)
     for process in (loudspeaker, room):
         process.terminate(), process.wait()
@@ -59,12 +61,14 @@ def test_the_played_speech_is_the_reference_and_ends_when_the_human_speaks(serve
     events = [json.loads(line) for line in (tmp_path / "heard/events.jsonl").read_text().splitlines()]
     noticed = next(event["time"] for event in events if event["kind"] == "speech_started")
     assert float((tmp_path / "noticed").read_text().split()[0]) == noticed
+    asked = next(event for event in events if event["kind"] == "voice_gain")
+    assert float(asked["detail"]) == pytest.approx(0.25, abs=0.01) and asked["time"] < noticed
     reference = np.rint(32768 * soundfile.read(tmp_path / "heard/reference.wav", dtype="float32")[0]).astype("<i2")
     first, ended = (int(at) for at in np.flatnonzero(reference)[[0, -1]])
     assert -0.05 < ended / 16_000 - noticed < 2.0  # what is noticed was played before; a busy machine is behind
     assert ended < reference.size - 8000 and ended - first < robot.size - 16_000  # else it would go on to the end
     assert share(reference[first + 8000 : ended - 400], robot) > 0.3
-    if server.system == "pulseaudio":
+    if loopback.system == "pulseaudio":
         assert share(from_loudspeaker, reference) > 0.3
     else:  # whose graph runs at 48 kHz: no sample stays what it is
         assert arrived(from_loudspeaker.astype(np.float32), reference[first:ended].astype(np.float32)) > 0.95

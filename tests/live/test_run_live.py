@@ -212,14 +212,6 @@ def test_the_doctor_finds_the_virtual_machine_fit(server):
     assert "set-up" not in quiet and "chirps" not in result.stderr
 
 
-@pytest.fixture
-def loopback(server):
-    """The microphone hears what the output plays."""
-    words = ("source=robot.monitor", "sink=robot_mic", "latency_msec=60", "adjust_time=0")
-    subprocess.run(["pactl", "load-module", "module-loopback", *words], env=server.environment, check=True)
-    return server
-
-
 def test_the_doctor_hears_the_robot_by_the_way_that_run_takes(loopback):
     checks, _ = doctor(loopback)
     told = re.match(r"the microphone hears the robot after (\d+) ms, \d+ dB above the noise", checks["set-up"]["found"])
