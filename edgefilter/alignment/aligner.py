@@ -107,7 +107,7 @@ class Aligner:
         # samples from the beginning of an utterance until it is heard, most likely and at most
         self._likely, self._latest = (int((s + 0.35) * SAMPLE_RATE) for s in (min(max_lag_s, LIKELY_LAG_S), max_lag_s))
         self._calibrated = None if profile is None else list(profile.running_responses())
-        self._first = FirstSounds(hop, self._calibrated[0]) if self._calibrated else None
+        self._first = FirstSounds(hop, self._calibrated[0] if self._calibrated else None)
         kernel_table()
         self.reset()
 
@@ -123,8 +123,7 @@ class Aligner:
     def reset(self) -> None:
         """Forget everything, as after construction."""
         self._used = [0]
-        if self._first:
-            self._first.reset()
+        self._first.reset()
         self._listen_for(self._calibrated)
         self._ref = DelayBuffer(self._lags.span + SAMPLE_RATE)
         self._mics = [DelayBuffer(self._ref.capacity)]
@@ -519,7 +518,7 @@ class Aligner:
         waits = False
         if self._open and self._log_odds >= 0.0 and self._ref.end <= self._open[0].start + self._likely:
             waits = self._refuted or not (self._coarse or self._open[0].lost)
-        if self._first is None:
-            return waits and self._onsets.varies and (self._refuted or not self._known)
-        waits = waits or self._expected is not None
-        return self._first.step(mic, reference, self._onsets.peak, state, waits)
+        unknown = self._calibrated is None and (self._refuted or not self._known)
+        expected = waits or self._expected is not None
+        loud = self._first.step(mic, reference, self._onsets.peak, state, expected)
+        return loud or (waits and unknown and self._onsets.varies)

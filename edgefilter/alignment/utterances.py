@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections import deque
 from dataclasses import dataclass
@@ -189,14 +190,15 @@ class Announcements:
 
 
 class FirstSounds:
-    """Tells, by its level, whether the microphone holds a calibrated robot at another delay than the present one.
+    """Tells, by its level, whether the microphone holds the robot at another delay than the present one.
 
-    hop: samples per step. response: (taps,), calibrated impulse response from the reference to the microphone.
+    hop: samples per step. response: (taps,), calibrated impulse response from the reference to the microphone; without one nothing
+    is told until the robot has been heard.
     """
 
-    def __init__(self, hop: int, response: Samples) -> None:
+    def __init__(self, hop: int, response: Samples | None) -> None:
         self._hop = hop
-        self._calibrated = float(np.sum(np.square(response)))
+        self._calibrated = math.inf if response is None else float(np.sum(np.square(response)))
         self.reset()
 
     def reset(self) -> None:
@@ -211,7 +213,8 @@ class FirstSounds:
         power, brought = float(np.dot(mic, mic)), float(np.dot(explained, explained))
         if state == "locked" and brought > 0.1 * self._hop * loudest:
             self._heard = True
-            self._gain += LEARNING * (min(power / brought, 2.0 * self._gain) - self._gain)
+            before = power / brought if math.isinf(self._gain) else self._gain
+            self._gain = before + LEARNING * (min(power / brought, 2.0 * before) - before)
         if not waits:
             self._since = 0
             return False
