@@ -65,8 +65,8 @@ class Aligned(NamedTuple):
     "coarse": no sharp arrival was found yet, the delay is known to within 25 ms; the reference is read 25 ms early. "lost":
     it was found, but the last looks did not see it, beside a loud human or after a jump; delay is carried on, with its
     drift. "locked": its delay is followed. at_any_lag: what is heard may be an utterance at a lag that nobody knows: it was
-    not found so far, and no delay is known, or the one of before was refuted; of a calibrated robot, it is too loud for
-    anybody else (FirstSounds). wait: samples by which the microphone must be delayed to fit the reference, WAIT at most.
+    not found so far, and no delay is known, or the one of before was refuted; or it is too loud for anybody else
+    (FirstSounds). wait: samples by which the microphone must be delayed to fit the reference, WAIT at most.
     past: the last seconds of both channels. belief: probabilities of the lags
     after the latest searches, in a hop in which one of them has ended; else None.
     """

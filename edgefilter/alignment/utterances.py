@@ -203,7 +203,7 @@ class FirstSounds:
 
     def reset(self) -> None:
         """As before the first hop."""
-        self._gain, self._heard, self._since = self._calibrated, False, 0
+        self._gain, self._heard, self._since, self._before = self._calibrated, False, 0, 0
 
     def step(self, mic: Samples, explained: Samples, loudest: float, state: AlignmentState, waits: bool) -> bool:
         """Take a hop of the microphone and of the reference at the present delay, zeros where there is none, (hop,) each.
@@ -215,10 +215,11 @@ class FirstSounds:
             self._heard = True
             before = power / brought if math.isinf(self._gain) else self._gain
             self._gain = before + LEARNING * (min(power / brought, 2.0 * before) - before)
-        if not waits:
-            self._since = 0
-            return False
         least = LOUD * self._hop * (loudest if self._heard else max(loudest, USUAL))
-        if self._since or power > self._gain * max(least, EXPLAINED * brought):
+        loud = power > self._gain * max(least, EXPLAINED * brought)
+        if not waits:
+            self._since, self._before = 0, LONGEST if loud else max(self._before - self._hop, 0)
+            return False
+        if self._since or (loud and not self._before):  # who was as loud before the utterance began is another
             self._since += self._hop
         return 0 < self._since <= (LONGEST if self._heard else np.inf)
