@@ -14,6 +14,8 @@ from edgefilter.types import SAMPLE_RATE, Samples
 from export.simulate.loudspeaker import active_rms
 from export.simulate.material import Material
 
+WHINE = 0.5
+"""Share of the moving robots whose gears whine, as voices do in harmonics of a pitch that goes up and down."""
 CHANGING, RECORDED, BACKGROUND, TALKERS = 0.2, 0.3, 0.2, 0.4
 """Shares of wide items whose fan changes its speed, whose fan is a recording, with something sounding in the background
 besides, and, of the last, those in which that is people."""
@@ -72,7 +74,46 @@ def motors(rng: np.random.Generator, material: Material, played: Samples, rms: f
     delay = int(rng.integers(width))
     loud = loud[delay : delay + played.size]
     moving = np.clip(loud / max(float(np.quantile(loud, 0.9)), 1e-9), 0.0, 1.0) ** rng.uniform(0.3, 1.5)
-    return (rms / max(active_rms(sound), 1e-9) * moving * sound).astype(np.float32)
+    sound = moving * sound
+    if rng.random() < WHINE:
+        sound = gears(rng, loud > 0.1 * loud.max())
+    return (rms / max(active_rms(sound), 1e-9) * sound).astype(np.float32)
+
+
+def gears(rng: np.random.Generator, talking: np.ndarray) -> Samples:
+    """Gears of one to three joints (n,), which begin to turn while the robot is talking, (n,) bool; their pitch goes with their speed."""
+    seconds, whole = np.arange(talking.size) / SAMPLE_RATE, np.zeros(talking.size)
+    for _ in range(int(rng.integers(1, 4))):
+        speed = _turns(rng, talking)
+        uneven = np.interp(
+            seconds, seconds[:: SAMPLE_RATE // 20], rng.normal(1.0, 0.01, seconds[:: SAMPLE_RATE // 20].size)
+        )
+        pitch_hz = 10 ** rng.uniform(math.log10(80), math.log10(1500)) * speed * uneven
+        turned, slope, tone = np.cumsum(pitch_hz) / SAMPLE_RATE, rng.uniform(0.2, 2.0), np.zeros(talking.size)
+        for harmonic in range(1, int(rng.integers(2, 25))):
+            size = 10 ** (rng.normal(0.0, 6.0) / 20) * harmonic**-slope
+            heard = harmonic * pitch_hz < 0.45 * SAMPLE_RATE
+            tone += size * heard * np.sin(2 * np.pi * (harmonic * turned + rng.random()))
+        rubbing = fan(rng, talking.size, 1.0)[0] * (1.0 + rng.uniform(0.0, 0.9) * np.sin(2 * np.pi * turned))
+        tone /= max(float(tone.std()), 1e-9)
+        whole += (
+            rng.uniform(0.3, 1.0) * speed ** rng.uniform(0.5, 1.5) * (tone + 10 ** rng.uniform(-1.0, 0.5) * rubbing)
+        )
+    body = signal.firwin2(255, np.linspace(0, 1, GRID_BINS), amplitude(rng) ** 0.5)
+    return signal.oaconvolve(whole, body, "same").astype(np.float32)
+
+
+def _turns(rng: np.random.Generator, talking: np.ndarray) -> Samples:
+    """Speed of a joint (n,), 0 to 1: turns of 0.16 to 1.6 s with ramps, one after the other, each begun while the robot is talking."""
+    speed, at = np.zeros(talking.size), 0
+    while at < talking.size:
+        size = int(10 ** rng.uniform(-0.8, 0.2) * SAMPLE_RATE)
+        if talking[at]:
+            ramp = rng.uniform(0.02, 0.3) * size
+            turn = np.minimum(np.minimum(np.arange(size), np.arange(size, 0, -1)) / ramp, 1.0)
+            speed[at : at + size] = (rng.uniform(0.2, 1.0) * turn)[: talking.size - at]
+        at += size + int(rng.exponential(0.5) * SAMPLE_RATE)
+    return speed
 
 
 def knocks(rng: np.random.Generator, material: Material, clean: Samples, rms: float) -> Samples:

@@ -261,6 +261,20 @@ def test_knocks_are_short_as_loud_as_the_human_and_begin_while_nobody_speaks(par
     assert fan.knocks(np.random.default_rng(0), parts, np.zeros(RATE, np.float32), rms).any()  # nobody, no recordings
 
 
+def test_gears_turn_only_from_where_the_robot_talks_and_whine_in_harmonics_of_a_pitch_that_moves():
+    talking = np.arange(6 * RATE) < 3 * RATE
+    share, peaks = [], []
+    for seed in range(12):
+        sound = fan.gears(np.random.default_rng(seed), talking)
+        assert np.isfinite(sound).all() and sound.any() and not sound[5 * RATE :].any()  # 1.6 s: the longest turn
+        power = np.square(np.abs(np.fft.rfft(sound[: 3 * RATE].reshape(-1, RATE // 10) * np.hanning(RATE // 10))))
+        loud = power.sum(1) > 0.1 * power.sum(1).max()
+        share.append(np.mean(np.sort(power[loud], axis=1)[:, -24:].sum(1) / power[loud].sum(1)))
+        peaks.append(np.unique(power[loud].argmax(1)).size)
+    assert max(share) > 0.8  # of the power lies in 24 of 801 bins: tones
+    assert np.median(peaks) > 3
+
+
 def test_who_says_three_words_is_drawn_seldom():
     corpus = Corpus({"few": (), "many": ()}, {"few": 2.0, "many": 60.0})
     rng = np.random.default_rng(0)
