@@ -7,7 +7,7 @@ import soundfile
 from edgefilter import EgoFilter, enhance
 from edgefilter.alignment.aligner import Aligned, Aligner
 from edgefilter.alignment.lag_search import MOST_LAG_S
-from edgefilter.alignment.utterances import LONGEST, FirstSounds
+from edgefilter.alignment.utterances import LONGEST, RECENT, FirstSounds
 from edgefilter.filter.budget import DEMO
 from tests.alignment.scene import RATE, fan, hear, known_path, room, run, speech_like, utterances
 
@@ -145,12 +145,12 @@ def test_from_the_first_sample_on_and_until_nothing_is_waited_for():
     assert not first.step(loud, loud, 1.0, "begun", True)  # the present delay explains it
 
 
-@pytest.mark.parametrize("silent", [LONGEST // HOP - 2, LONGEST // HOP + 2])
+@pytest.mark.parametrize("silent", [RECENT // HOP - 2, RECENT // HOP + 2])
 def test_who_was_as_loud_a_moment_before_the_utterance_began_is_another(silent):
     first, loud, nothing = FirstSounds(HOP, np.ones(1)), np.ones(HOP, np.float32), np.zeros(HOP, np.float32)
     for sound in (loud, *[nothing] * silent):
         first.step(sound, nothing, 0.0, "idle", False)
-    assert first.step(loud, nothing, 0.0, "begun", True) == (silent * HOP > LONGEST)
+    assert first.step(loud, nothing, 0.0, "begun", True) == (silent * HOP > RECENT)
 
 
 @pytest.mark.parametrize(("engine", "least_db"), [("crnn", 20.0), ("ss", 15.0), ("linear", 10.0)])
