@@ -73,7 +73,9 @@ class GainFit:
         self.x, self._chosen = measurement.reference[part], np.flatnonzero(chosen)
         self._target = measurement.whiten(measurement.recording[part])[self._chosen]
         self.loud_db = float(decibels(np.max(block_power(self.x, SAMPLE_RATE // 50), initial=0.0), 1e-9))
-        left = self._left([self.x])
+        self._latest: tuple[Array, tuple[Sequence[Samples], Samples, Samples]] | None = None
+        rows = self._rows([self.x])
+        left = self._target - rows @ self._weights(rows, self._target)
         self.without, self._heard_plain = float(left @ left), self._target - left
 
     def best(self, starts: Sequence[Array]) -> tuple[Array, float] | None:
@@ -127,22 +129,25 @@ class GainFit:
         return np.linalg.solve(normal + RIDGE * np.trace(normal) * np.eye(right.size) + 1e-30, right)
 
     def _residual(self, unknowns: Array) -> Samples:
-        return self._left(self._make(self.x, unknowns))
+        _, rows, weights = self._filtered(unknowns)
+        return self._target - rows @ weights
+
+    def _filtered(self, unknowns: Array) -> tuple[Sequence[Samples], Samples, Samples]:
+        """Sounds, their rows and their filters with these unknowns; kept, since the solver asks for slopes where it has asked for the residual."""
+        if self._latest is None or not np.array_equal(self._latest[0], unknowns):
+            sounds = self._make(self.x, unknowns)
+            rows = self._rows(sounds)
+            self._latest = unknowns.copy(), (sounds, rows, self._weights(rows, self._target))
+        return self._latest[1]
 
     def _slopes(self, unknowns: Array) -> Array:
         """Derivatives of the residual, (chosen, k), with those of the filters approximated as Kaufman (1975) does."""
-        sounds = self._make(self.x, unknowns)
-        rows = self._rows(sounds)
-        gains = self._weights(rows, self._target).reshape(len(sounds), TAPS).sum(axis=1)
+        sounds, rows, weights = self._filtered(unknowns)
+        gains = weights.reshape(len(sounds), TAPS).sum(axis=1)
         here, moved = gains @ np.stack(sounds), np.empty((self._chosen.size, unknowns.size), np.float32)
         for column, (there, step) in zip(moved.T, self._reach.moved(unknowns), strict=True):
             column[:] = self._heard((gains @ np.stack(self._make(self.x, there)) - here) / step)[self._chosen]
         return rows @ self._weights(rows, moved) - moved
-
-    def _left(self, sounds: Sequence[Samples]) -> Samples:
-        """Residual of the excerpt after the sounds, each through its best filter of TAPS taps, (chosen,)."""
-        rows = self._rows(sounds)
-        return self._target - rows @ self._weights(rows, self._target)
 
     def _heard(self, sound: Samples) -> Samples:
         return self._measurement.heard(self._model, sound)
