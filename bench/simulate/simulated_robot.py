@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import pyroomacoustics as pra
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy import signal, special
 
@@ -212,21 +214,29 @@ def fan_noise(rng: Rng, amplitude: Array, n: int) -> Array:
     return signal.oaconvolve(rng.standard_normal(n + taps.size - 1), taps, mode="valid")
 
 
+@cache
+def _between() -> Array:
+    """Taps of a Kaiser-windowed sinc (beta 9: -90 dB) as Chebyshev series of the place between two samples, to 1e-15, (25, 64)."""
+
+    def taps(place: Array) -> Array:
+        distance = np.arange(-31, 33) - 0.5 * (place[:, None] + 1.0)
+        return np.sinc(distance) * special.i0(9.0 * np.sqrt(1.0 - (distance / 32) ** 2)) / special.i0(9.0)
+
+    return np.polynomial.chebyshev.chebinterpolate(taps, 24)
+
+
 def warp(x: Array, ppm: float) -> Array:
-    """Samples x (n,) read at t (1 + ppm 1e-6) by a Kaiser-windowed sinc of 64 taps (beta 9: -90 dB)."""
+    """Samples x (n,) read at t (1 + ppm 1e-6)."""
     if ppm == 0.0:
         return x.copy()
-    half_width = 32
-    padded = np.concatenate([np.zeros(half_width), x, np.zeros(2 * half_width)])
-    out = np.empty_like(x)
-    offsets = np.arange(-half_width + 1, half_width + 1)
+    taps, out = _between(), np.empty_like(x)
+    width = taps.shape[1]
+    read = sliding_window_view(np.pad(x, (width // 2 - 1, width + int(x.size * max(ppm, 0.0) * 1e-6))), width)
     for start in range(0, x.size, PIECE):
         position = np.arange(start, min(start + PIECE, x.size)) * (1.0 + ppm * 1e-6)
-        whole = np.minimum(np.floor(position).astype(int), x.size)
-        distance = offsets[None] - (position - whole)[:, None]
-        window = special.i0(9.0 * np.sqrt(np.clip(1.0 - (distance / half_width) ** 2, 0.0, 1.0))) / special.i0(9.0)
-        samples = padded[whole[:, None] + offsets[None] + half_width]
-        out[start : start + position.size] = np.sum(samples * np.sinc(distance) * window, axis=1)
+        whole = np.floor(position).astype(int)
+        series = np.polynomial.chebyshev.chebvander(2.0 * (position - whole) - 1.0, len(taps) - 1)
+        out[start : start + position.size] = np.einsum("ij,ij->i", read[whole], series @ taps)
     return out
 
 
