@@ -158,14 +158,15 @@ def stand(
     asked = wanted
     # Sabine's formula misses the decay of an absorbing room by a quarter: ask again for what came out short
     for _ in range(3):
-        robot, human = _image_sources(size, asked, microphone, (microphone + robot_m * direction, mouth))
+        (human,) = _image_sources(size, asked, microphone, (mouth,))
         found = float(pra.experimental.measure_rt60(human, fs=RATE, decay_db=30))
         asked, last = min(asked * wanted / found, 1.5), asked
+    loudspeaker = microphone + robot_m * direction
     if array is not None:
-        sources = (microphone + robot_m * direction, mouth, *(mouth_somewhere() for _ in range(moves)))
+        sources = (loudspeaker, mouth, *(mouth_somewhere() for _ in range(moves)))
         robot, human, *elsewhere = _image_sources(size, last, microphone + array, sources)
         return Room(found, robot, human, tuple(elsewhere))
-    return Room(found, robot, human)
+    return Room(found, *_image_sources(size, last, microphone, (loudspeaker,)), human)
 
 
 def _image_sources(size: Array, rt60_s: float, microphone: Array, sources: tuple[Array, ...]) -> list[Array]:
