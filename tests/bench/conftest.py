@@ -39,7 +39,7 @@ def short_demonstrations() -> Iterator[None]:
     whole = provenance.Demo.signals
 
     def first_seconds(demo: provenance.Demo) -> Signals:
-        return Signals(*(samples if samples is None else samples[: 6 * RATE] for samples in whole(demo)[:3]))
+        return Signals(*(samples if samples is None else samples[: 2 * RATE] for samples in whole(demo)[:3]))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(provenance.Demo, "signals", first_seconds)
