@@ -1,7 +1,9 @@
 """Dataset, network, losses and the training loop on seconds of sound."""
 
 import json
+import shutil
 from dataclasses import asdict
+from functools import partial
 
 import numpy as np
 import pytest
@@ -348,26 +350,33 @@ def test_the_papers_loss_vanishes_at_the_right_mask():
     assert float(power_law_loss(torch.ones_like(mixture), mixture, 0.5 * mixture)) > 0.01
 
 
+def smoked(folder, name, *more):
+    """Exit code of four steps of train.py into folder / name."""
+    folders = ["--data", str(folder / "d"), "--validation", str(folder / "v"), "--output", str(folder / name)]
+    return train.main([*folders, "--smoke", *more])
+
+
+TINY = ("--hop", "32", "--channels", "4", "4", "4", "4", "--hidden", "8")
+NARROW = ("--network", "paper", "--filters", "3", "2", "--lstm", "4", "--hidden", "5")
+
+
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory):
+    """A folder with a training of a network of each kind, "tiny" and "narrow"."""
+    folder = tmp_path_factory.mktemp("begun")
+    assert smoked(folder, "tiny", *TINY) == smoked(folder, "narrow", *NARROW) == 0
+    return folder
+
+
 @pytest.mark.slow
-def test_training_runs_stops_and_goes_on(tmp_path, capsys):
-    small = ["--hop", "32", "--channels", "4", "4", "4", "4", "--hidden", "8"]
-    arguments = [
-        "--data",
-        str(tmp_path / "d"),
-        "--validation",
-        str(tmp_path / "v"),
-        "--output",
-        str(tmp_path / "run"),
-        *small,
-        "--smoke",
-    ]
-    train.main(arguments)
-    steps = [json.loads(line)["step"] for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+def test_training_runs_stops_and_goes_on(begun, tmp_path, capsys):
+    run = shutil.copytree(begun / "tiny", tmp_path / "run")
+    steps = [json.loads(line)["step"] for line in (run / "log.jsonl").read_text().splitlines()]
     assert steps == [2, 4]
-    assert torch.load(tmp_path / "run" / "best.pt", weights_only=False)["config"]["n_fft"] == 64
-    train.main(arguments)
+    assert torch.load(run / "best.pt", weights_only=False)["config"]["n_fft"] == 64
+    assert smoked(tmp_path, "run", *TINY) == 0
     assert "from step 4" in capsys.readouterr().out
-    assert list((tmp_path / "run").glob("events.*"))
+    assert list(run.glob("events.*"))
 
 
 def test_the_rate_rises_stays_and_falls():
@@ -381,49 +390,40 @@ def test_the_rate_rises_stays_and_falls():
 
 
 @pytest.mark.slow
-def test_training_starts_from_given_weights_of_the_same_shape(tmp_path, capsys):
-    def run(name, hidden, *more, hop="32"):
-        folders = ["--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", str(tmp_path / name)]
-        small = ["--hop", hop, "--channels", "4", "4", "4", "4", "--hidden", hidden, "--smoke"]
-        return train.main([*folders, *small, *more])
-
-    assert run("first", "8") == 0
-    first = torch.load(tmp_path / "first" / "best.pt", weights_only=False)["network"]
-    assert run("second", "8", "--start", str(tmp_path / "first" / "best.pt"), "--rate", "0", "--seed", "5") == 0
+def test_training_starts_from_given_weights_of_the_same_shape(begun, trained, tmp_path, capsys):
+    start = ("--start", str(begun / "tiny" / "best.pt"))
+    first = torch.load(begun / "tiny" / "best.pt", weights_only=False)["network"]
+    assert trained("second", *TINY, *start, "--rate", "0", "--seed", "5") == 0
     found = torch.load(tmp_path / "second" / "best.pt", weights_only=False)
-    second, earlier = found["network"], torch.load(tmp_path / "first" / "best.pt", weights_only=False)
+    second, earlier = found["network"], torch.load(begun / "tiny" / "best.pt", weights_only=False)
     assert found["stages"][0] == {"steps": earlier["step"], "seed": earlier["seed"], "items": earlier["items"]}
     assert found["stages"][1]["seed"] == 5 and found["seed"] == [earlier["seed"], 5]
     assert found["step"] == earlier["step"] + found["stages"][1]["steps"] > earlier["step"]
     assert all(torch.allclose(first[name], second[name], atol=1e-4) for name in first)
-    assert run("third", "12", "--start", str(tmp_path / "first" / "best.pt")) == 1
+    assert trained("third", *TINY, "--hidden", "12", *start) == 1
     assert "hidden=12" in capsys.readouterr().err
     start = ("--start", str(tmp_path / "bands" / "best.pt"), "--rate", "0")
-    assert run("bands", "8", "--erb", "16") == 0
-    assert run("other transform", "8", "--erb", "16", *start, hop="20") == 0
+    assert trained("bands", *TINY, "--erb", "16") == 0
+    assert trained("other transform", *TINY, "--erb", "16", *start, "--hop", "20") == 0
     first, second = (torch.load(tmp_path / n / "best.pt", weights_only=False) for n in ("bands", "other transform"))
     assert (first["config"]["n_fft"], second["config"]["n_fft"]) == (64, 40)
     assert all(torch.allclose(first["network"][name], second["network"][name], atol=1e-4) for name in first["network"])
-    assert run("other bands", "8", "--erb", "32", *start) == 1
+    assert trained("other bands", *TINY, "--erb", "32", *start) == 1
     assert "erb=16" in capsys.readouterr().err
 
 
 @pytest.mark.slow
-def test_small_weights_are_half_of_the_average_and_training_goes_on_from_them(tmp_path, monkeypatch, capsys):
-    def run(name, *more):
-        folders = ["--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", str(tmp_path / name)]
-        small = ["--hop", "32", "--channels", "4", "4", "4", "4", "--hidden", "8", "--smoke"]
-        return train.main([*folders, *small, *more])
-
-    assert run("first") == 0
-    last, weights = tmp_path / "first" / "last.pt", tmp_path / "weights.pt"
+def test_small_weights_are_half_of_the_average_and_training_goes_on_from_them(
+    begun, trained, tmp_path, monkeypatch, capsys
+):
+    last, weights = begun / "tiny" / "last.pt", tmp_path / "weights.pt"
     assert checkpoint.main([str(last), "--output", str(weights)]) == 0
     full, half = (torch.load(path, weights_only=True) for path in (last, weights))
     assert half["network"].keys() == full["network"].keys() and "resume" not in half and half["step"] == 4
     for name, value in half["network"].items():
         assert value.dtype == torch.float16 and torch.allclose(value.float(), full["network"][name], atol=2e-3)
     assert weights.stat().st_size < 0.3 * last.stat().st_size
-    assert run("second", "--start", str(weights)) == 0
+    assert trained("second", *TINY, "--start", str(weights)) == 0
     second, mean = tmp_path / "second" / "last.pt", tmp_path / "mean.pt"
     assert checkpoint.main([str(second), "--output", str(mean), "--full", "--mean", str(last)]) == 0
     later, both = (torch.load(path, weights_only=True) for path in (second, mean))
@@ -438,24 +438,15 @@ def test_small_weights_are_half_of_the_average_and_training_goes_on_from_them(tm
     assert "expected at most" in capsys.readouterr().err and not weights.exists()
 
 
-NARROW = ("--network", "paper", "--filters", "3", "2", "--lstm", "4", "--hidden", "5")
-
-
 @pytest.fixture
 def trained(tmp_path):
     """Four steps of train.py into tmp_path / name; its exit code."""
-
-    def run(name, *more):
-        folders = ["--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", str(tmp_path / name)]
-        return train.main([*folders, "--smoke", *more])
-
-    return run
+    return partial(smoked, tmp_path)
 
 
 @pytest.mark.slow
-def test_the_papers_network_trains_in_the_width_that_was_asked_for(trained, tmp_path):
-    assert trained("run", *NARROW) == 0
-    saved = torch.load(tmp_path / "run" / "best.pt", weights_only=True)
+def test_the_papers_network_trains_in_the_width_that_was_asked_for(begun):
+    saved = torch.load(begun / "narrow" / "best.pt", weights_only=True)
     config = {"bins": 601, "filters": (3,) * 7 + (2,), "lstm": 4, "hidden": 5, "batch_norm": False}
     assert saved["kind"] == "paper" and saved["config"] == config
     assert saved["network"]["blstm.weight_hh_l0"].shape == (4 * 4, 4)
@@ -508,8 +499,8 @@ def test_sizes_that_a_network_cannot_have_are_refused_in_one_line(trained, capsy
 
 
 @pytest.mark.slow
-def test_a_folder_of_another_training_is_left_alone(trained, tmp_path, capsys):
-    assert trained("run", *NARROW) == 0
+def test_a_folder_of_another_training_is_left_alone(begun, trained, tmp_path, capsys):
+    shutil.copytree(begun / "narrow", tmp_path / "run")
     before = (tmp_path / "run" / "last.pt").read_bytes()
     assert trained("run", *NARROW, "--lstm", "6") == 1
     said = capsys.readouterr().err.splitlines()[-1]
