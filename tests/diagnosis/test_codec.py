@@ -14,7 +14,7 @@ from edgefilter.echo.effects.catalogue import find
 from edgefilter.echo.measurement import Values
 from tests.diagnosis.robot_scene import coded, lossy, profile, record, voice
 
-SECONDS = 8.0
+SECONDS = 5.5
 
 
 def fitted(recording: np.ndarray, x: np.ndarray) -> tuple[Straightened, Values]:

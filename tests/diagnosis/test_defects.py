@@ -41,7 +41,7 @@ def gained(recording: np.ndarray, gain_db: np.ndarray) -> np.ndarray:
 def test_one_recording_has_one_excess_in_compare_add_diagnose_and_report_when_the_profile_holds_a_microphone_gain() -> (
     None
 ):
-    x, gain_db = voice(8.0), 6 * np.hanning(320)
+    x, gain_db = voice(6.0), 6 * np.hanning(320)
     plain = profile()
     robot = plain.with_echo(plain.echo.with_effect("mic_agc", {"gain_db": gain_db, "knots_hz": 40.0}))
     recording = gained(record(x, plain.echo.with_effect("playback_gain", {"gain_db": -2.0})), gain_db)
@@ -57,7 +57,7 @@ def test_one_recording_has_one_excess_in_compare_add_diagnose_and_report_when_th
 
 
 def test_a_rattle_in_the_profile_counts_in_compare_as_it_does_in_diagnose() -> None:
-    x = voice(8.0)
+    x = voice(6.0)
     knocks = {"threshold": 0.02, "power": 1e-3, "decay_ms": 4.0}
     robot = profile().with_echo(profile().echo.with_effect("rattle", knocks))
     recording = record(x)
@@ -68,7 +68,7 @@ def test_a_rattle_in_the_profile_counts_in_compare_as_it_does_in_diagnose() -> N
 
 
 def test_a_fan_of_digital_zeros_gives_figures_and_no_infinities() -> None:
-    x = voice(6.0)
+    x = voice(4.5)
     robot = replace(profile(), noise_psd=np.zeros(601, np.float32))
     clean = np.round(EchoModel(path()).predict(delayed(x, DELAY - PRE_ROLL)) * 2**15) / 2**15
     with warnings.catch_warnings():
@@ -84,7 +84,7 @@ def test_a_fan_of_digital_zeros_gives_figures_and_no_infinities() -> None:
 
 @pytest.mark.slow
 def test_the_words_name_a_band_of_the_scorer() -> None:
-    x = voice(8.0)
+    x = voice(6.0)
     clean = EchoModel(path()).predict(delayed(x, DELAY - PRE_ROLL))
     tone = signal.sosfilt(signal.butter(4, [1500, 2000], "band", fs=RATE, output="sos"), clean)
     ring = tone * np.sin(2 * np.pi * 170 * np.arange(x.size) / RATE)
@@ -123,7 +123,7 @@ def fragile(monkeypatch) -> Fragile:
 
 @pytest.mark.parametrize(("failing", "known"), [(1, True), (3, False)])
 def test_an_interval_fit_that_fails_does_not_kill_a_finished_diagnosis(fragile, failing, known) -> None:
-    x = voice(8.0)
+    x = voice(6.0)
     prepared = prepare(profile(), record(x, EchoModel(path()).with_effect("fragile", {"amount": 0.4})), x)
     bench = Workbench(prepared, Criteria())
     step = bench.attempt("fragile", prepared.model)
@@ -137,7 +137,7 @@ def test_an_interval_fit_that_fails_does_not_kill_a_finished_diagnosis(fragile, 
 
 
 def test_a_fit_that_fails_is_a_note_in_the_diagnosis_and_no_python_warning(fragile) -> None:
-    x = voice(6.0)
+    x = voice(4.5)
     fragile.failures.extend([np.linalg.LinAlgError("Singular matrix")] * 50)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -151,7 +151,7 @@ def test_a_fit_that_fails_is_a_note_in_the_diagnosis_and_no_python_warning(fragi
 
 
 def test_a_search_says_what_it_has_found_so_far() -> None:
-    x, said = voice(6.0), []
+    x, said = voice(4.5), []
     clipped = np.clip(0.5 * record(x), -0.01, 0.01)
     diagnose(profile(), clipped, x, progress=said.append, criteria=Criteria(most_effects=2))
     assert said[0].startswith("trying") and "so far" not in said[0]
@@ -159,7 +159,7 @@ def test_a_search_says_what_it_has_found_so_far() -> None:
 
 
 def test_a_search_that_is_cut_short_says_so() -> None:
-    x = voice(6.0)
+    x = voice(4.5)
     found = diagnose(
         profile(),
         record(
@@ -176,7 +176,7 @@ JUMP = {"times_s": 4.3, "samples": 37.0}
 
 
 def test_a_jump_is_not_replayed_in_another_recording() -> None:
-    x, other = voice(9.0), voice(9.0, seed=21)
+    x, other = voice(6.5), voice(6.5, seed=21)
     jumped, later = record(x, EchoModel(path()).with_effect("delay_jump", JUMP)), record(other, seed=22)
     knowing, before, after = add(profile(), "delay_jump", jumped, x)
     assert after.excess_db < 0.5 < 3.0 < before.excess_db
@@ -191,7 +191,7 @@ def test_a_jump_is_not_replayed_in_another_recording() -> None:
 def test_a_jump_stays_with_its_recording_through_the_files_and_add_says_so(tmp_path, capsys) -> None:
     import soundfile as sf
 
-    x = voice(9.0)
+    x = voice(6.5)
     jumped = record(x, EchoModel(path()).with_effect("delay_jump", JUMP))
     for name, samples in (("mic", jumped), ("ref", x), ("other", record(x, seed=5))):
         sf.write(tmp_path / f"{name}.wav", samples, RATE, "PCM_16")
@@ -239,7 +239,7 @@ def coloured(x: np.ndarray) -> np.ndarray:
 
 @pytest.mark.slow
 def test_another_colour_of_the_loudspeaker_is_not_called_late_reverberation() -> None:
-    x = voice(8.0)
+    x = voice(6.0)
     clean = coloured(EchoModel(path()).predict(delayed(x, DELAY - PRE_ROLL)))
     found = diagnose(profile(), (clean + FAN * np.random.default_rng(3).standard_normal(x.size)).astype(np.float32), x)
     assert "late_reverb" not in [finding.effect for finding in found.ranking]
@@ -248,7 +248,7 @@ def test_another_colour_of_the_loudspeaker_is_not_called_late_reverberation() ->
 
 @pytest.mark.slow
 def test_a_room_that_sounds_longer_is_called_late_reverberation() -> None:
-    x, rng = voice(8.0), np.random.default_rng(8)
+    x, rng = voice(6.0), np.random.default_rng(8)
     tail = np.arange(RATE // 2)
     room = np.concatenate((np.zeros(60), 0.01 * rng.standard_normal(tail.size) * np.exp(-6.9 * tail / (0.6 * RATE))))
     clean = EchoModel(path()).predict(delayed(x, DELAY - PRE_ROLL)).astype(float)

@@ -24,7 +24,7 @@ TREMBLE = {"rate_hz": 6.0, "mean": 1.0, "waves": np.array([0.4, 0, 0, 0, 0, 0, 0
     ids=["nothing", "volume", "room", "tremolo", "room and volume"],
 )
 def test_the_families_that_are_there_are_seen_the_largest_first(robot, seen):
-    x = voice(12.0)
+    x = voice(8.0)
     found = Recording(record(x, robot), x, profile()).at_first_sight()
     assert list(found)[: len(seen)] == seen and bool(found) == bool(seen)
     assert list(found.values()) == sorted(found.values(), reverse=True)

@@ -14,7 +14,7 @@ import soundfile as sf
 
 from bench.diagnosis import names
 from edgefilter.calibration.calibrate import calibrate
-from edgefilter.diagnosis.recording import add, compare, diagnose
+from edgefilter.diagnosis.recording import Recording, compare
 from edgefilter.profile.data import Profile
 
 pytestmark = pytest.mark.slow
@@ -58,8 +58,9 @@ def test_a_robot_with_nothing_hidden_is_explained() -> None:
     signals = read(DATA / "dev" / "03")
     profile = calibrated(signals)
     assert json.loads((DATA / "dev" / "03" / "truth.json").read_text())["effects"] == ["none"]
-    assert compare(profile, signals["mic"], signals["ref"]).excess_db < 0.3
-    found = diagnose(profile, signals["mic"], signals["ref"])
+    recording = Recording(signals["mic"], signals["ref"], profile)
+    assert recording.compare().excess_db < 0.3
+    found = recording.diagnose()
     assert (found.verdict, found.ranking) == ("explained", ())
 
 
@@ -76,12 +77,12 @@ def test_the_hidden_effect_is_named_and_its_adding_keeps_the_promise(name: str, 
     signals = read(DATA / "dev" / name)
     truth = json.loads((DATA / "dev" / name / "truth.json").read_text())
     profile, cut = calibrated(signals), pause(signals["ref"]) if lasting else signals["ref"].size
-    mic, reference = signals["mic"][:cut], signals["ref"][:cut]
-    found = diagnose(profile, mic, reference)
+    recording = Recording(signals["mic"][:cut], signals["ref"][:cut], profile)
+    found = recording.diagnose()
     assert (found.verdict, [finding.effect for finding in found.ranking]) == ("missing", truth["effects"])
     finding = found.ranking[0]
     promised = finding.excess_before_db, finding.excess_after_db, finding.share
-    knowing, before, after = add(profile, finding.effect, mic, reference)
+    knowing, before, after = recording.add(finding.effect)
     assert_promise_kept(promised, before.excess_db, after.excess_db)
     assert after.excess_db < 1.0  # what is promised of linear, timing and clipping effects
     if lasting:

@@ -249,7 +249,7 @@ def test_a_curve_is_written_with_as_many_digits_as_mean_something() -> None:
 
 @pytest.mark.slow
 def test_an_equaliser_ahead_of_what_bends_the_voice_is_told_from_one_behind() -> None:
-    x = voice(8.0)
+    x = voice(6.0)
     bell, high = (
         signal.lfilter(*signal.butter(1, band, "band", fs=SAMPLE_RATE), x) for band in ((700, 1400), (2500, 5000))
     )

@@ -89,7 +89,7 @@ SHELVED = signal.lfilter(*shelf(-4.0), path())
     ],
 )
 def test_a_stationary_change_is_named_as_what_it_is(h: np.ndarray, named: str) -> None:
-    x = voice(8.0)
+    x = voice(6.0)
     found = diagnose(profile(), through(h, x), x)
     assert (found.verdict, [finding.effect for finding in found.ranking]) == ("missing", [named])
     assert found.remaining_db < 1.0  # the product's promise for linear effects
@@ -109,7 +109,7 @@ def test_a_stationary_change_is_named_as_what_it_is(h: np.ndarray, named: str) -
 def test_a_turned_volume_is_named_beside_a_filter_that_could_take_it_up(
     h: np.ndarray, beside: str, turned_db: float
 ) -> None:
-    x = voice(8.0)
+    x = voice(6.0)
     found = diagnose(profile(), through(10 ** (turned_db / 20) * h, x), x)
     assert (found.verdict, {finding.effect for finding in found.ranking}) == ("missing", {beside, "playback_gain"})
     volume = next(finding for finding in found.ranking if finding.effect == "playback_gain")
@@ -117,7 +117,7 @@ def test_a_turned_volume_is_named_beside_a_filter_that_could_take_it_up(
 
 
 def test_beside_a_drift_an_effect_is_fitted_to_a_recording_without_it() -> None:
-    x, drift = voice(10.0), {"ppm": 200.0, "offset": 3.0}
+    x, drift = voice(7.0), {"ppm": 200.0, "offset": 3.0}
     robot = EchoModel(SHELVED.astype(np.float32)).with_effect("clock_drift", drift)
     recording = Recording(record(x, robot), x, profile()).straightened
     model = recording.model.with_effect("clock_drift", recording.fitted("clock_drift", recording.model))

@@ -16,7 +16,7 @@ from edgefilter.echo.model import EchoModel
 from edgefilter.echo.running import reach
 from tests.diagnosis.robot_scene import FAN, path, profile, record, voice
 
-SECONDS = 12.0
+SECONDS = 8.0
 FRAME, STEP = 320, 160
 
 
