@@ -63,7 +63,7 @@ def plain(scene):
 
 @pytest.fixture(scope="module")
 def scene():
-    return Scene(seconds=10.0)
+    return Scene(seconds=8.0)
 
 
 @pytest.fixture(scope="module")
