@@ -37,27 +37,10 @@ def outside(tensor, location, length=4):
         entry.key, entry.value = key, value
 
 
-def weights_elsewhere(model):
-    outside(model.graph.initializer[0], "/etc/hostname")
-
-
 def weights_beside_it(model):
     """In the working directory, in the right number: onnxruntime would take them."""
     weights = next(each for each in model.graph.initializer if each.name.endswith("norm.weight"))
     outside(weights, "weights", 4 * weights.dims[0])
-
-
-def constant_elsewhere(model):
-    outside(next(node for node in model.graph.node if node.op_type == "Constant").attribute[0].t, "../secret")
-
-
-def operator_of_a_library(model):
-    model.graph.node[0].domain = "com.example.run_my_code"
-
-
-def library_of_many_lines(model):
-    """Found by random damage."""
-    model.graph.node[0].domain = "\n\x0bhidden\x18"
 
 
 def weights_said_to_be_elsewhere(model):
@@ -72,21 +55,11 @@ def weights_that_are_no_numbers(model):
     weights.CopyFrom(onnx.numpy_helper.from_array(values, weights.name))
 
 
-def state_beyond_all_memory(model):
-    entry = next(entry for entry in model.metadata_props if entry.key == "states")
-    entry.value = json.dumps([["state_0", [1, 2**40]]])
+def says(key, value):
+    def change(model):
+        next(entry for entry in model.metadata_props if entry.key == key).value = value
 
-
-def transform_beyond_all_memory(model):
-    next(entry for entry in model.metadata_props if entry.key == "n_fft").value = str(2**40)
-
-
-def hop_beyond_all_memory(model):
-    next(entry for entry in model.metadata_props if entry.key == "hop").value = str(2**40)
-
-
-def text_of_many_lines(model):
-    next(entry for entry in model.metadata_props if entry.key == "type").value = "a\n" * 10_000
+    return change
 
 
 def straight(kind, inputs, outputs):
@@ -132,53 +105,50 @@ def graphs_in_a_list(model):
     model.graph.node[0].attribute.append(attribute)
 
 
-def empty_graph(model):
-    model.graph.node[0].attribute.add().g.SetInParent()
-
-
 def function_of_its_own(model):
     node = onnx.helper.make_node("Identity", ["x"], ["y"])
     one = onnx.helper.make_operatorsetid("", 17)
     model.functions.append(onnx.helper.make_function("", "Relu", ["x"], ["y"], [node], [one]))
 
 
-def training_steps(model):
-    model.training_info.add().algorithm.CopyFrom(straight("Identity", ["a"], ["b"]))
+WITHIN, ELSEWHERE = "has graphs within its graph", "takes its weights from other files"
+CHANGES = {
+    "loop without end": (loop_without_end, WITHIN),
+    "branch": (branch, WITHIN),
+    "scan": (scan, WITHIN),
+    "graphs in a list": (graphs_in_a_list, WITHIN),
+    "empty graph": (lambda m: m.graph.node[0].attribute.add().g.SetInParent(), WITHIN),
+    "training steps": (lambda m: m.training_info.add().algorithm.CopyFrom(straight("Identity", ["a"], ["b"])), WITHIN),
+    "function of its own": (function_of_its_own, "has functions of its own"),
+    "sparse weights elsewhere": (lambda m: outside(m.graph.sparse_initializer.add().values, "weights"), ELSEWHERE),
+    "sparse constant elsewhere": (
+        lambda m: outside(m.graph.node[0].attribute.add().sparse_tensor.indices, "weights"),
+        ELSEWHERE,
+    ),
+    "weights elsewhere": (lambda m: outside(m.graph.initializer[0], "/etc/hostname"), ELSEWHERE),
+    "weights beside it": (weights_beside_it, ELSEWHERE),
+    "weights said to be elsewhere": (weights_said_to_be_elsewhere, ELSEWHERE),
+    "constant elsewhere": (
+        lambda m: outside(next(n for n in m.graph.node if n.op_type == "Constant").attribute[0].t, "../secret"),
+        ELSEWHERE,
+    ),
+    "operator of a library": (
+        lambda m: setattr(m.graph.node[0], "domain", "com.example.run_my_code"),
+        "asks for operators of .com.example.run_my_code",
+    ),
+    "library of many lines": (  # found by random damage
+        lambda m: setattr(m.graph.node[0], "domain", "\n\x0bhidden\x18"),
+        r"asks for operators of . hidden\\x18.",
+    ),
+    "weights that are no numbers": (weights_that_are_no_numbers, "answers with values that are not finite"),
+    "state beyond all memory": (says("states", json.dumps([["state_0", [1, 2**40]]])), "unusable metadata .*state_0"),
+    "transform beyond all memory": (says("n_fft", str(2**40)), "unusable metadata .*expected at most"),
+    "hop beyond all memory": (says("hop", str(2**40)), "unusable metadata .*expected at most"),
+    "text of many lines": (says("type", "a\n" * 10_000), "has type a a a"),
+}
 
 
-def sparse_weights_elsewhere(model):
-    outside(model.graph.sparse_initializer.add().values, "weights")
-
-
-def sparse_constant_elsewhere(model):
-    outside(model.graph.node[0].attribute.add().sparse_tensor.indices, "weights")
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (loop_without_end, "has graphs within its graph"),
-        (branch, "has graphs within its graph"),
-        (scan, "has graphs within its graph"),
-        (graphs_in_a_list, "has graphs within its graph"),
-        (empty_graph, "has graphs within its graph"),
-        (training_steps, "has graphs within its graph"),
-        (function_of_its_own, "has functions of its own"),
-        (sparse_weights_elsewhere, "takes its weights from other files"),
-        (sparse_constant_elsewhere, "takes its weights from other files"),
-        (weights_elsewhere, "takes its weights from other files"),
-        (weights_beside_it, "takes its weights from other files"),
-        (weights_said_to_be_elsewhere, "takes its weights from other files"),
-        (constant_elsewhere, "takes its weights from other files"),
-        (operator_of_a_library, "asks for operators of .com.example.run_my_code"),
-        (library_of_many_lines, r"asks for operators of . hidden\\x18."),
-        (weights_that_are_no_numbers, "answers with values that are not finite"),
-        (state_beyond_all_memory, "unusable metadata .*state_0"),
-        (transform_beyond_all_memory, "unusable metadata .*expected at most"),
-        (hop_beyond_all_memory, "unusable metadata .*expected at most"),
-        (text_of_many_lines, "has type a a a"),
-    ],
-)
+@pytest.mark.parametrize(("change", "words"), CHANGES.values(), ids=CHANGES)
 def test_a_model_that_leads_out_of_its_file_or_gives_no_numbers_is_refused(tmp_path, monkeypatch, capfd, change, words):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "weights").write_bytes(bytes(1 << 16))
@@ -255,7 +225,7 @@ def test_any_bytes_are_refused_in_one_line(data, tmp_path_factory):
 @pytest.mark.slow
 def test_whatever_a_model_says_of_itself_it_is_taken_or_refused_in_one_line(key, value, tmp_path_factory):
     model = onnx.load(EDGE)
-    next(entry for entry in model.metadata_props if entry.key == key).value = value
+    says(key, value)(model)
     path = tmp_path_factory.getbasetemp() / "said.onnx"
     path.write_bytes(model.SerializeToString())
     try:
