@@ -38,12 +38,19 @@ def test_equal_microphones_are_all_used_from_the_first_second_on() -> None:
     assert watched.used.all() and listen(watched, alike()) == {} and watched.used.all()
 
 
-def test_one_microphone_that_is_sound_for_a_second_is_still_left_out() -> None:
-    watched, broken = Microphones(3, HOP), alike()
+def test_a_microphone_that_is_sound_again_is_used_again_after_three_seconds() -> None:
+    watched, sound, broken = Microphones(3, HOP), alike(), alike()
     broken[1] = 0.0
-    assert listen(watched, broken) == {1: "silent"}
-    assert list(listen(watched, alike())) == [1] and list(listen(watched, alike())) == [1]
-    assert listen(watched, alike()) == {}
+    assert [listen(watched, heard) for heard in (broken, sound, sound, sound)] == [{1: "silent"}] * 3 + [{}]
+    # a loose contact
+    assert [list(listen(watched, heard)) for heard in (broken, sound, broken, sound, sound)] == [[1]] * 5
+
+
+@pytest.mark.parametrize(("level_db", "often", "out"), [(-0.05, 16, {1: "clipped"}), (-0.05, 15, {}), (-0.15, 62, {})])
+def test_a_microphone_is_clipped_where_16_samples_of_a_second_reach_full_scale_nearly(level_db, often, out) -> None:
+    mics = alike()
+    mics[1, 7 : often * HOP : HOP] = -(10 ** (level_db / 20))
+    assert listen(Microphones(3, HOP), mics) == out
 
 
 @pytest.mark.parametrize("level", [1.0, 1e-5])
