@@ -26,10 +26,12 @@ def speechlike(seconds: float, seed: int = 1) -> np.ndarray:
     return (0.03 * noise * level).astype(np.float32)
 
 
+def scene(seconds: float, taps: int = 3000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A path, such a sound, and what a microphone hears of it by that path."""
+    h, x = path(taps=taps), speechlike(seconds)
+    return h, x, signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+
+
 def run(canceller: Canceller, mic: np.ndarray, reference: np.ndarray, located: bool = True) -> np.ndarray:
-    hop = canceller.hop
-    steps = [
-        canceller.step(mic[i : i + hop], reference[i : i + hop], located).error
-        for i in range(0, mic.size - hop + 1, hop)
-    ]
-    return np.concatenate((mic[:0], *steps))
+    hops = [slice(at, at + canceller.hop) for at in range(0, mic.size - canceller.hop + 1, canceller.hop)]
+    return np.concatenate((mic[:0], *(canceller.step(mic[hop], reference[hop], located).error for hop in hops)))

@@ -11,7 +11,7 @@ from scipy import signal
 from edgefilter.errors import SignalError
 from edgefilter.filter.canceller import COLD, LEARNED, Canceller, CancellerOutput, ShelfStates
 from edgefilter.session import level_db as db
-from tests.filter.canceller_scene import path, run, speechlike
+from tests.filter.canceller_scene import path, run, scene, speechlike
 from tests.learning.scenes import loudspeaker, voice
 
 HOP = 256
@@ -21,16 +21,14 @@ SETTLED = 6 * HOP
 
 @pytest.mark.parametrize("hop", [160, 256, 200])
 def test_known_path_cancels_to_float_precision_from_the_first_hop(hop: int) -> None:
-    h, x = path(), speechlike(1.0)
-    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    h, x, mic = scene(1.0)
     error = run(Canceller(hop, 6400, h), mic, x)
     # float32 transforms leave -100 dB and less; 60 dB is asked for because adaptation noise comes on top
     assert db(error[: 5 * hop]) < db(mic[: 5 * hop]) - 60
 
 
 def test_unknown_path_is_learnt() -> None:
-    h, x = path(), speechlike(6.0)
-    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    h, x, mic = scene(6.0)
     error = run(Canceller(HOP, 3200), mic, x)
     # 20 dB: what the published filter reaches within some seconds on coloured noise without any noise at the microphone
     assert db(error[-16000:]) < db(mic[-16000:]) - 20
@@ -41,8 +39,7 @@ def test_unknown_path_is_learnt() -> None:
 )
 @pytest.mark.filterwarnings("ignore:(overflow|invalid value) encountered:RuntimeWarning")
 def test_a_filter_that_has_diverged_begins_anew(poisoned: str, poison: float) -> None:
-    h, x = path(), speechlike(4.0)
-    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    h, x, mic = scene(4.0)
     {"x": x, "mic": mic}[poisoned][16_100] = poison
     canceller = Canceller(HOP, 3200, h)
     error = run(canceller, mic, x)
@@ -53,8 +50,7 @@ def test_a_filter_that_has_diverged_begins_anew(poisoned: str, poison: float) ->
 @pytest.mark.parametrize("taught_s", [0.0, 3.0])
 def test_a_filter_that_was_resumed_recovers_after_a_divergence(taught_s: float) -> None:
     """Its weights, their covariance and its ageing were zero for ever."""
-    h, x = path(), speechlike(8.0)
-    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    h, x, mic = scene(8.0)
     canceller, at = Canceller(HOP, 3200), int(taught_s * 16000) // HOP * HOP
     run(canceller, mic[:at], x[:at])
     canceller = Canceller.resumed(canceller.state(), HOP)
@@ -68,8 +64,7 @@ def test_a_filter_that_was_resumed_recovers_after_a_divergence(taught_s: float) 
 
 def test_a_filter_without_a_path_that_has_diverged_learns_as_a_new_one_does() -> None:
     """The hop in which it begins anew has no reference left to tell the path's power by: 1e12 of it was expected."""
-    h, x = path(), speechlike(8.0)
-    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    h, x, mic = scene(8.0)
     canceller = Canceller(HOP, 3200)
     x[16_000] = 1e12
     error = run(canceller, mic, x)
@@ -78,8 +73,7 @@ def test_a_filter_without_a_path_that_has_diverged_learns_as_a_new_one_does() ->
 
 
 def test_a_filter_that_was_resumed_is_as_sure_of_its_path_as_one_that_was_not() -> None:
-    h, x = path(), speechlike(4.0)
-    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    h, x, mic = scene(4.0)
     canceller = Canceller(HOP, 3200, h)
     run(canceller, mic[:32_000], x[:32_000])
     resumed = Canceller.resumed(canceller.state(), HOP)
@@ -91,8 +85,7 @@ def test_a_filter_that_was_resumed_is_as_sure_of_its_path_as_one_that_was_not() 
 
 def test_a_filter_that_was_resumed_knows_how_far_the_volume_was_turned() -> None:
     """Otherwise a profile that is written later has the turned volume twice in what lies beyond the adapted taps."""
-    h, x = path(), speechlike(4.0)
-    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    h, x, mic = scene(4.0)
     mic[16_000:] *= np.float32(10 ** (6 / 20))
     canceller = Canceller(HOP, 3200, h)
     run(canceller, mic[:32_000], x[:32_000])
@@ -124,9 +117,8 @@ def test_of_a_path_that_has_become_another_one_as_much_is_kept_as_is_heard(monke
     run(canceller, 0.1 * speechlike(2.0, seed=5), x)  # nothing of an echo that is far louder than the microphone
     after = canceller.state()
     assert np.abs(after.weights).max() < 0.01 * loudest
-    assert (
-        before.covariance.max() < after.covariance.max() < loudest**2
-    )  # once reopened, it does not grow with every doubt
+    # once reopened, it does not grow with every doubt
+    assert before.covariance.max() < after.covariance.max() < loudest**2
 
 
 def test_a_robot_that_was_calibrated_in_a_dead_room_learns_the_room_it_is_carried_to() -> None:
@@ -156,12 +148,9 @@ def test_the_first_loud_hop_after_a_faint_noise_does_not_open_the_nonlinear_prod
 def test_a_distorting_loudspeaker_is_predicted_beyond_what_is_linear() -> None:
     x, h = voice(1, 4.0), path()
     mic = signal.oaconvolve(loudspeaker(x), h)[: x.size].astype(np.float32)
-    left = {
-        name: db(run(Canceller(HOP, 3200, h, adaptation), mic, x)[-32_000:]) - db(mic[-32_000:])
-        for name, adaptation in (("linear", COLD), ("products", LEARNED))
-    }
+    linear, products = (db(run(Canceller(HOP, 3200, h, each), mic, x)[-32_000:]) for each in (COLD, LEARNED))
     # 6.6 dB less were seen, and 1.2 with the displacement taken for 2.4 times as small
-    assert left["products"] < left["linear"] - 4.0
+    assert products < linear - 4.0
 
 
 def test_error_and_echo_add_up_to_the_microphone_exactly() -> None:
@@ -173,8 +162,7 @@ def test_error_and_echo_add_up_to_the_microphone_exactly() -> None:
 
 
 def test_echo_of_a_hop_depends_on_nothing_later_than_the_hop() -> None:
-    x, h = speechlike(1.0), path()
-    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    h, x, mic = scene(1.0)
     other = x.copy()
     other[8192:] = 0.1
     first, second = run(Canceller(HOP, 3200, h), mic, x), run(Canceller(HOP, 3200, h), mic, other)
@@ -251,16 +239,8 @@ def anything(loudest: float = 0.0, shelves: ShelfStates = ShelfStates()) -> Canc
     rng, state = np.random.default_rng(0), Canceller(HOP, 1024, adaptation=LEARNED).state()
     weights = rng.standard_normal((*state.weights.shape, 2)) @ [1.0, 1.0j]
     covariance = rng.uniform(0.0, 1.0, state.covariance.shape)
-    return Canceller.resumed(
-        replace(
-            state,
-            weights=weights.astype(np.complex64),
-            covariance=covariance.astype(np.float32),
-            loudest=max(loudest, state.loudest),
-            shelves=shelves,
-        ),
-        HOP,
-    )
+    drawn = {"weights": weights.astype(np.complex64), "covariance": covariance.astype(np.float32), "shelves": shelves}
+    return Canceller.resumed(replace(state, loudest=max(loudest, state.loudest), **drawn), HOP)
 
 
 def heard_of(canceller: Canceller, x: np.ndarray) -> list[CancellerOutput]:
@@ -355,14 +335,12 @@ def test_the_path_begins_anew_where_another_microphone_of_an_array_tells_and_onl
 
 
 def test_a_turned_volume_is_followed_within_a_fifth_of_a_second() -> None:
-    h, x = path(), speechlike(4.0)
-    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    h, x, mic = scene(4.0)
     mic[32_000:] *= np.float32(10 ** (3 / 20))
     canceller = Canceller(HOP, 3200, h)
     error = run(canceller, mic, x)
     after = slice(32_000 + 3200, 32_000 + 9600)
-    # one factor explains the change, so the error falls far below what 3 dB leave (-7.7 dB); 30 dB leaves room for the
-    # adaptation
+    # one factor explains the change: far below what 3 dB leave (-7.7 dB); 30 dB leaves room for the adaptation
     assert db(error[after]) < db(mic[after]) - 30
     assert canceller.stats()["gain_db"] == pytest.approx(3.0, abs=0.2)  # 80 ms of correlation; the rest is adapted
 
@@ -370,8 +348,7 @@ def test_a_turned_volume_is_followed_within_a_fifth_of_a_second() -> None:
 @pytest.mark.parametrize("factor", [0.3, 3.0])
 @pytest.mark.parametrize("warm", [True, False])
 def test_a_volume_turned_by_10_db_is_healed_within_seconds(factor, warm) -> None:
-    h, x = path(), speechlike(10.0)
-    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    h, x, mic = scene(10.0)
     mic[96_000:] *= np.float32(factor)
     mic += 1e-5 * np.random.default_rng(8).standard_normal(mic.size).astype(np.float32)
     canceller = Canceller(HOP, 3200, h if warm else None)
@@ -400,9 +377,8 @@ def test_an_echo_that_has_not_arrived_yet_is_not_subtracted() -> None:
     error = run(canceller, fan, x, located=False)
     # the first hop fades the echo out; after it the fan passes as it is, and the path is kept for when the echo arrives
     np.testing.assert_array_equal(error[HOP : 8 * HOP], fan[HOP : 8 * HOP])
-    np.testing.assert_allclose(
-        canceller.impulse_response()[: h.size], h[: canceller.taps], atol=1e-3
-    )  # float32 and one fading hop
+    # float32 and one fading hop
+    np.testing.assert_allclose(canceller.impulse_response()[: h.size], h[: canceller.taps], atol=1e-3)
 
 
 def test_reset_is_a_fresh_start() -> None:
@@ -414,8 +390,7 @@ def test_reset_is_a_fresh_start() -> None:
 
 
 def test_adapted_path_can_be_exported() -> None:
-    h, x = path(taps=1600), speechlike(6.0)
-    mic = signal.oaconvolve(x, h)[: x.size].astype(np.float32)
+    h, x, mic = scene(6.0, taps=1600)
     canceller = Canceller(HOP, 1600)
     run(canceller, mic, x)
     found = canceller.impulse_response()

@@ -30,7 +30,7 @@ def reference(hops: int) -> np.ndarray:
     return (0.1 * rng.standard_normal((hops, HOP)) * rng.random((hops, 1))).astype(np.float32)
 
 
-@pytest.mark.parametrize(("taps", "kept"), [(300, 2048), (4000, 4096), (20_000, 8192)])
+@pytest.mark.parametrize(("taps", "kept"), [(300, 2048), (2048, 2048), (4000, 4096), (5000, 5120), (20_000, 8192)])
 def test_a_path_is_as_long_as_the_profile_s_between_an_eighth_and_half_a_second(taps: int, kept: int) -> None:
     known = robot()
     response = np.resize(known.echo.impulse_response, taps).astype(np.float32)

@@ -28,9 +28,8 @@ def test_expected_squares_become_the_power_that_such_noise_has_in_a_frame() -> N
     expected = Unpredictable(STFT, [np.full(601, 1 / 8000), low])
     for part in (square[:256], square[256:]):
         found = expected.step([part, np.zeros(256, np.float32)])
-    np.testing.assert_allclose(
-        found, heard, rtol=0.15
-    )  # the mean of 4000 frames is known to 1.6 %, at either end to 2.2
+    # the mean of 4000 frames is known to 1.6 %, at either end to 2.2
+    np.testing.assert_allclose(found, heard, rtol=0.15)
     coloured = Unpredictable(STFT, [low])
     for part in (square[:256], square[256:]):
         found = coloured.step([part])
@@ -43,16 +42,12 @@ def test_what_no_waveform_predicts_is_expected_to_be_left_and_not_learnt_as_leak
     added, nothing = np.full(257, 0.2, np.float32), np.zeros(257, np.float32)
     told, untold = Residual(STFT), Residual(STFT)
     speaks = np.arange(200)[:, None] % 10 >= 5  # what never pauses would be noise
-    pairs = zip(
-        (speaks * echo).astype(np.complex64), (speaks * np.sqrt(0.1) * knocks).astype(np.complex64), strict=True
-    )
-    for e, k in pairs:
+    for e, k in zip(*(speaks * np.complex64((echo, np.sqrt(0.1) * knocks))).astype(np.complex64)):
         _, knowing = told.step(e, k, nothing, added)
         _, without = untold.step(e, k, nothing)
     leakage = knowing.mean() - 0.2
-    assert (
-        0.0 < leakage < 0.3 * without.mean()
-    )  # who is not told takes it for leakage, and learns more of that every hop
+    # who is not told takes it for leakage, and learns more of that every hop
+    assert 0.0 < leakage < 0.3 * without.mean()
 
 
 def test_a_microphone_that_clips_does_not_teach_the_canceller_another_path() -> None:

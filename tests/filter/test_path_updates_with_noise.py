@@ -39,11 +39,8 @@ class Teacher:
 
     def observe(self, hop: FilteredHop) -> PathUpdate | None:
         self.hops += 1
-        return (
-            PathUpdate(PathState(self.effects, self.path.canceller), "learned", "another path")
-            if self.hops == 30
-            else None
-        )
+        path = PathState(self.effects, self.path.canceller)
+        return PathUpdate(path, "learned", "another path") if self.hops == 30 else None
 
     def stats(self):
         return {}
