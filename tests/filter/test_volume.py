@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import soundfile
 
 from edgefilter import EgoFilter
-from edgefilter.filter.budget import DEMO
 from edgefilter.filter.volume import EchoLimiter, Volume
+from tests.program import demo
 
 HOP = 256
 
@@ -73,10 +72,18 @@ def test_an_echo_that_stays_too_loud_for_half_a_second_is_put_down_to_another_pa
 
 
 def factor_after(mic: np.ndarray, echo: np.ndarray, path: str = "known") -> float:
-    volume = Volume(HOP, path)
-    for m, e in zip(mic, echo, strict=True):
-        volume.follow(m, np.float32(volume.gain) * e)
-    return volume.gain
+    return turns(mic, echo, path)[0].gain
+
+
+def turns(mic: np.ndarray, echo: np.ndarray, path: str = "known") -> tuple[Volume, list[int], list[int]]:
+    """What has followed them, in which hops it turned, and after which ones it was looking for a factor or trying one."""
+    volume, turned, suspected = Volume(HOP, path), [], []
+    for at, (m, e) in enumerate(zip(mic, echo, strict=True)):
+        if volume.follow(m, np.float32(volume.gain) * e) != 1.0:
+            turned.append(at)
+        if volume.suspected:
+            suspected.append(at)
+    return volume, turned, suspected
 
 
 @pytest.mark.parametrize("factor", [0.3, 2.0, 30.0])
@@ -112,17 +119,6 @@ def test_the_volume_of_a_path_that_is_unknown_yet_means_nothing() -> None:
     assert factor_after(2.0 * echo, echo, path="unknown") == 1.0
     learned = np.concatenate((echo, 2.0 * echo))
     assert factor_after(learned, np.concatenate((echo, echo)), path="unknown") == pytest.approx(2.0, rel=0.01)
-
-
-def turns(mic: np.ndarray, echo: np.ndarray, path: str = "known") -> tuple[Volume, list[int], list[int]]:
-    """What has followed them, in which hops it turned, and after which ones it was looking for a factor or trying one."""
-    volume, turned, suspected = Volume(HOP, path), [], []
-    for at, (m, e) in enumerate(zip(mic, echo, strict=True)):
-        if volume.follow(m, np.float32(volume.gain) * e) != 1.0:
-            turned.append(at)
-        if volume.suspected:
-            suspected.append(at)
-    return volume, turned, suspected
 
 
 def test_after_a_click_of_the_robot_the_volume_is_followed_once_its_peak_has_faded() -> None:
@@ -226,7 +222,7 @@ def test_another_path_is_noticed_though_now_and_then_a_hop_fits() -> None:
 
 def test_a_voice_that_is_lowered_for_a_moment_is_no_turned_volume_where_the_reference_carries_it() -> None:
     """By 12 dB for 0.4 s, again and again, as an agent may do at a suspicion; and, last, a reference that does not tell."""
-    ref, rng = soundfile.read(DEMO / "reference.flac", dtype="float32")[0][: 6 * 16000], np.random.default_rng(0)
+    ref, rng = demo("reference")[0][: 6 * 16000], np.random.default_rng(0)
     since = np.arange(ref.size) % 24000
     gain = np.where((since < 6400) & (np.arange(ref.size) > 3 * 16000), 10 ** (-12 / 20), 1.0)
     lowered = ref * np.convolve(np.pad(gain, (80, 79), mode="edge"), np.full(160, 1 / 160), "valid")
