@@ -1,6 +1,8 @@
 """The simulated room of the examples, and a filter whose reference can be looked at."""
 
+import asyncio
 import importlib
+import inspect
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +17,15 @@ from edgefilter.profile.array import ArrayCalibration
 
 collect_ignore = [] if sys.version_info >= (3, 11) else ["test_pipecat.py"]  # for which Pipecat is not made
 EXAMPLES = Path(__file__).parents[2] / "docs/examples"
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem):
+    """A test that is a coroutine has a loop of its own, and two minutes."""
+    if inspect.iscoroutinefunction(pyfuncitem.obj):
+        words = {name: pyfuncitem.funcargs[name] for name in pyfuncitem._fixtureinfo.argnames}
+        asyncio.run(asyncio.wait_for(pyfuncitem.obj(**words), 120))
+        return True
 
 
 class Watched(EgoFilter):
@@ -84,9 +95,13 @@ def talking(room_of, pair):
 
 
 @pytest.fixture
-def ego(room_of, monkeypatch):
+def patient(monkeypatch):
     """The room's time is not the machine's: a slow machine is no microphone that was off."""
     monkeypatch.setattr(duplex, "WAITED_S", 1e9)
+
+
+@pytest.fixture
+def ego(room_of, patient):
     return Watched(room_of.PROFILE)
 
 

@@ -1,8 +1,7 @@
 """A program of the Social Interaction Cloud: a room's microphone as a component, the human's ears, and a robot that talks.
 
-Usage: sic_program.py FOLDER [four|asks]. Writes what the human's component has sent, as JSON and samples. four: the microphone
-sends four channels at 48 kHz, interleaved, as Pepper's does where all are asked for; the human then is at 48 kHz, too. asks: the
-program says what the robot says as it is played, in place of all at once, so that it can be lowered.
+Usage: sic_program.py FOLDER [four]. Writes what the human's component has sent, as JSON and samples. four: the microphone
+sends four channels at 48 kHz, interleaved, as Pepper's does where all are asked for; the human then is at 48 kHz, too.
 """
 
 import json
@@ -30,7 +29,7 @@ FRAME = 1600  # 0.1 s
 FRAMES = 60
 ROOM = simulated.Room()
 BEGIN = threading.Event()
-FOUR, ASKS = (sys.argv[2:] == [word] for word in ("four", "asks"))
+FOUR = sys.argv[2:] == ["four"]
 
 
 def messages():
@@ -96,16 +95,11 @@ def main():
             sound.append(np.frombuffer(message.waveform, "<i2"))
 
     microphone = RoomMicrophone()
-    conf = HumanConf(mic_channels=[0, 1, 2, 3] if FOUR else None, ask_db=12.0 if ASKS else None)
-    human = Human(input_source=microphone, conf=conf)
+    human = Human(input_source=microphone, conf=HumanConf(mic_channels=[0, 1, 2, 3] if FOUR else None))
     human.register_callback(take)
-    said = np.rint(simulated.ROBOT * 32767).astype("<i2")
-    begun, pieces = time.monotonic(), np.split(said, range(FRAME, said.size, FRAME)) if ASKS else [said]
     ROOM.play(simulated.ROBOT)
-    for at, piece in enumerate(pieces):
-        time.sleep(max(0.0, begun + at * 0.1 - time.monotonic()))
-        human.request(AudioRequest(piece.tobytes(), 16000), block=not ASKS)
-        BEGIN.set()
+    human.request(AudioRequest(np.rint(simulated.ROBOT * 32767).astype("<i2").tobytes(), 16000))
+    BEGIN.set()
     end = time.monotonic() + 30
     while sum(map(len, sound)) < (3 if FOUR else 1) * (FRAMES - 2) * FRAME and time.monotonic() < end:
         time.sleep(0.1)

@@ -89,10 +89,8 @@ def test_nothing_over_8_khz_survives_and_the_log_says_so(caplog):
     ids=["float32", "float64", "int16", "(n, 1)", "(n, 2)", "interleaved", "bytes", "bytearray"],
 )
 def test_the_answer_has_the_type_and_shape_of_what_came_in(given):
-    stereo = len(NOISE) * (2 if not isinstance(given, bytes | bytearray) else 4) == np.size(given) or isinstance(
-        given, bytes | bytearray
-    )
-    canceller = EchoCanceller(16000, 2 if stereo else 1, engine="bypass")
+    mono = isinstance(given, np.ndarray) and given.size == len(NOISE)
+    canceller = EchoCanceller(16000, 1 if mono else 2, engine="bypass")
     out = canceller.process(given, given)
     assert type(out) is type(given) and len(out) == len(given)
     if isinstance(given, np.ndarray):
@@ -184,13 +182,12 @@ def hear(canceller, rate, mic, ref):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [EchoCanceller, lambda rate: EchoCanceller.create(rate // 100, 2048, rate)])
 @pytest.mark.parametrize("rate", [16000, 48000])
-def test_a_program_changes_one_import_and_hears_the_human(conversation, make, rate):
+def test_a_program_changes_one_import_and_hears_the_human(conversation, rate):
     mic, ref, human = conversation
     both = slice(9 * 16000, 15 * 16000)
     kept = hear(pywebrtc_audio.EchoCanceller(rate, 1), rate, mic, ref)
-    canceller = make(rate)
+    canceller = EchoCanceller(rate)
     out = hear(canceller, rate, mic, ref)
     assert out.dtype == kept.dtype and out.size == kept.size
     out = soxr.resample(out[canceller.delay :].astype(np.float32) / 32767, rate, 16000)
@@ -201,28 +198,33 @@ def test_a_program_changes_one_import_and_hears_the_human(conversation, make, ra
     assert "speech_started" in kinds and "realigned" in kinds
 
 
-def test_the_event_loop_goes_on_while_it_filters_and_calls_are_served_in_their_order():
+@pytest.mark.parametrize("rate", [16000, 48000])
+def test_one_that_is_made_as_speexdsp_s_is_does_the_same(conversation, rate):
+    short = [x[:16000] for x in conversation[:2]]
+    made, usual = (
+        hear(one, rate, *short) for one in (EchoCanceller.create(rate // 100, 2048, rate), EchoCanceller(rate))
+    )
+    assert usual.any() and np.array_equal(made, usual)
+
+
+async def test_the_event_loop_goes_on_while_it_filters_and_calls_are_served_in_their_order():
     mic = tone(16000)
-
-    async def talk():
-        async with EchoCanceller(16000, engine="bypass") as canceller:
-            blocks = [mic[at : at + 160] for at in range(0, mic.size, 160)]
-            tasks = [asyncio.create_task(canceller.process_async(block, block)) for block in blocks]
-            return np.concatenate(await asyncio.gather(*tasks))
-
-    expected = in_blocks(EchoCanceller(16000, engine="bypass"), mic, mic, (160,))
-    np.testing.assert_array_equal(asyncio.run(talk()), expected)
+    async with EchoCanceller(16000, engine="bypass") as canceller:
+        blocks = [mic[at : at + 160] for at in range(0, mic.size, 160)]
+        tasks = [asyncio.create_task(canceller.process_async(block, block)) for block in blocks]
+        found = np.concatenate(await asyncio.gather(*tasks))
+    np.testing.assert_array_equal(found, in_blocks(EchoCanceller(16000, engine="bypass"), mic, mic, (160,)))
 
 
 @pytest.mark.slow
 def test_it_says_whether_the_human_speaks_and_forgets_all_at_a_reset(conversation):
-    mic, ref, _ = conversation
+    mic, ref, _ = (x[7 * 16000 : 11 * 16000] for x in conversation)
     canceller = EchoCanceller(16000, profile=DEMO / "profile.npz")
-    first = canceller.process(mic[: 11 * 16000], ref[: 11 * 16000])
+    first = canceller.process(mic, ref)
     assert canceller.speaking
     canceller.reset()
     assert not canceller.speaking
-    np.testing.assert_array_equal(canceller.process(mic[: 11 * 16000], ref[: 11 * 16000]), first)
+    np.testing.assert_array_equal(canceller.process(mic, ref), first)
 
 
 @pytest.mark.parametrize("form", ["int16", "interleaved", "bytes"])

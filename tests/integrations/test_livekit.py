@@ -56,29 +56,24 @@ def through(ears, frame):
 
 
 @pytest.mark.slow
-def test_a_robot_that_talks_is_interrupted_and_its_reference_is_what_it_played(example, ego, check_conversation):
-    log, room, _ = asyncio.run(asyncio.wait_for(example("agent_livekit").converse(ego), 120))
+async def test_a_robot_that_talks_is_interrupted_and_its_reference_is_what_it_played(example, ego, check_conversation):
+    log, room, _ = await example("agent_livekit").converse(ego)
     check_conversation(room, ego, 3.0)
     kinds = [what.split(":")[0] for _, what in log]
     assert kinds == ["the human speaks", "the robot was interrupted", "the human said"]
 
 
-def test_an_audio_stream_sends_its_frames_through_it(ears):
+async def test_an_audio_stream_sends_its_frames_through_it(ears):
     """A real one, of a local track; it runs on a clock of its own, so that only what comes out is looked at."""
-
-    async def listen():
-        source = rtc.AudioSource(24_000, 1)
-        track = rtc.LocalAudioTrack.create_audio_track("microphone", source)
-        stream = rtc.AudioStream.from_track(
-            track=track, sample_rate=24_000, num_channels=1, frame_size_ms=50, noise_cancellation=ears
-        )
-        feeding = asyncio.create_task(source.capture_frame(frame_of(NOISE[:12_000])))
-        frames = [(await stream.__anext__()).frame for _ in range(8)]
-        feeding.cancel()
-        await stream.aclose()
-        return frames
-
-    frames = asyncio.run(asyncio.wait_for(listen(), 60))
+    source = rtc.AudioSource(24_000, 1)
+    track = rtc.LocalAudioTrack.create_audio_track("microphone", source)
+    stream = rtc.AudioStream.from_track(
+        track=track, sample_rate=24_000, num_channels=1, frame_size_ms=50, noise_cancellation=ears
+    )
+    feeding = asyncio.create_task(source.capture_frame(frame_of(NOISE[:12_000])))
+    frames = [(await stream.__anext__()).frame for _ in range(8)]
+    feeding.cancel()
+    await stream.aclose()
     assert {frame.samples_per_channel for frame in frames} == {1200}
     assert 8 * 800 * 0.8 < ears.duplex.ego.stats()["samples"] <= 8 * 800 + 800
 
@@ -101,22 +96,18 @@ def test_frames_come_out_as_long_as_they_went_in_and_late_by_less_than_a_fifth_o
     assert np.mean(out[-rate // 2 :] ** 2) == pytest.approx(0.01, rel=0.7), "the microphone, as no robot speaks"
 
 
-def test_the_tap_hands_everything_on_and_notes_what_is_played_paused_and_dropped(ears):
+async def test_the_tap_hands_everything_on_and_notes_what_is_played_paused_and_dropped(ears):
     sink = Sink()
-
-    async def talk():
-        tap = ears.tap(sink)
-        await tap.capture_frame(frame_of(NOISE[:24_000]))
-        tap.flush()
-        assert ears.duplex.queued_s == pytest.approx(1.0, abs=1e-3)
-        tap.pause()
-        through(ears, frame_of(NOISE[:2400]))
-        assert ears.duplex.stats()["played_s"] == 0
-        tap.resume()
-        tap.clear_buffer()
-        assert tap.sample_rate == 24_000 and tap.can_pause
-
-    asyncio.run(talk())
+    tap = ears.tap(sink)
+    await tap.capture_frame(frame_of(NOISE[:24_000]))
+    tap.flush()
+    assert ears.duplex.queued_s == pytest.approx(1.0, abs=1e-3)
+    tap.pause()
+    through(ears, frame_of(NOISE[:2400]))
+    assert ears.duplex.stats()["played_s"] == 0
+    tap.resume()
+    tap.clear_buffer()
+    assert tap.sample_rate == 24_000 and tap.can_pause
     assert sink.asked == [24_000, "flush", "pause", "resume", "clear"]
     assert ears.duplex.queued_s == 0 and ears.duplex.stats()["dropped_s"] == pytest.approx(1.0, abs=1e-3)
 
@@ -130,20 +121,15 @@ def test_the_tap_lowers_what_it_hands_on_where_the_filter_asks_for_it_and_so_is_
     np.testing.assert_array_equal(played, sink.heard)
 
 
-def test_after_a_pause_the_speech_that_the_room_had_thrown_away_is_no_reference(ears):
+async def test_after_a_pause_the_speech_that_the_room_had_thrown_away_is_no_reference(ears):
     """The room's output holds 0.2 s (livekit.agents.voice.room_io.ParticipantAudioOutput) and clears it when paused."""
-
-    async def talk():
-        tap = ears.tap(Sink())
-        await tap.capture_frame(frame_of(NOISE))
-        tap.flush()
-        tap.pause()
-        tap.resume()
-
-    asyncio.run(talk())
-    assert ears.duplex.stats()["dropped_s"] == pytest.approx(0.2) and ears.duplex.queued_s == pytest.approx(
-        1.8, abs=1e-3
-    )
+    tap = ears.tap(Sink())
+    await tap.capture_frame(frame_of(NOISE))
+    tap.flush()
+    tap.pause()
+    tap.resume()
+    assert ears.duplex.stats()["dropped_s"] == pytest.approx(0.2)
+    assert ears.duplex.queued_s == pytest.approx(1.8, abs=1e-3)
 
 
 def test_switched_off_it_gives_the_microphone_as_it_is(ears):
@@ -166,23 +152,22 @@ class Recogniser(stt.STT):
 
 
 @pytest.mark.parametrize("enabled", [True, False])
-def test_a_recogniser_behind_the_stream_adapter_gets_the_finished_turn_of_an_array(pair, enabled):
+async def test_a_recogniser_behind_the_stream_adapter_gets_the_finished_turn_of_an_array(pair, enabled):
     profile, sound = pair
     events, recogniser = [], Recogniser()
     ears = EgoProcessor(EgoFilter(profile, engine="crnn"), events.append, mic_channels=[1, 2])
     ears.enabled = enabled
-
-    async def converse():
-        stream = stt.StreamAdapter(stt=recogniser, vad=ears.vad()).stream()
-        for at in range(0, len(sound) - 319, 320):
-            pcm = np.rint(sound[at : at + 320] * 32768).astype("<i2").tobytes()
-            stream.push_frame(through(ears, rtc.AudioFrame(pcm, 16_000, 3, 320)))
-            await asyncio.sleep(0.001)
-        stream.end_input()
-        return [event.type.value async for event in stream]
-
-    said = asyncio.run(asyncio.wait_for(converse(), 120))
-    assert said == ["start_of_speech", "end_of_speech", "final_transcript"]
+    streams = stream, watch = stt.StreamAdapter(stt=recogniser, vad=ears.vad()).stream(), ears.vad().stream()
+    for at in range(0, len(sound) - 319, 320):
+        pcm = np.rint(sound[at : at + 320] * 32768).astype("<i2").tobytes()
+        frame = through(ears, rtc.AudioFrame(pcm, 16_000, 3, 320))
+        for each in streams:
+            each.push_frame(frame)
+        await asyncio.sleep(0.001)
+    for each in streams:
+        each.end_input()
+    assert [event.type.value async for event in stream] == ["start_of_speech", "end_of_speech", "final_transcript"]
+    tell_how_long_the_human_has_spoken_or_been_silent([event async for event in watch])
     (turn,) = [event.turn for event in events if event.turn]
     (heard,) = recogniser.segments
     assert heard.num_channels == 1 and ears.duplex.ego.stats()["array"]["microphones"] == 2
@@ -193,20 +178,7 @@ def test_a_recogniser_behind_the_stream_adapter_gets_the_finished_turn_of_an_arr
     assert ears.duplex.listeners == []
 
 
-def test_each_event_tells_how_long_the_human_has_spoken_or_been_silent(pair):
-    profile, sound = pair
-    ears = EgoProcessor(EgoFilter(profile, engine="crnn"), mic_channels=[1, 2])
-
-    async def watch():
-        stream = ears.vad().stream()
-        for at in range(0, len(sound) - 319, 320):
-            pcm = np.rint(sound[at : at + 320] * 32768).astype("<i2").tobytes()
-            stream.push_frame(through(ears, rtc.AudioFrame(pcm, 16_000, 3, 320)))
-            await asyncio.sleep(0.001)
-        stream.end_input()
-        return [event async for event in stream]
-
-    events = asyncio.run(asyncio.wait_for(watch(), 120))
+def tell_how_long_the_human_has_spoken_or_been_silent(events):
     frames = [event for event in events if event.type.value == "inference_done"]
     (end,) = [event for event in events if event.type.value == "end_of_speech"]
     spoke = [event for event in frames if event.speaking]

@@ -28,8 +28,8 @@ def filters():
 
 
 @pytest.mark.slow
-def test_a_robot_that_talks_is_interrupted_and_its_reference_is_what_it_played(example, ego, check_conversation):
-    log, room, _ = asyncio.run(asyncio.wait_for(example("agent_pipecat").converse(ego), 120))
+async def test_a_robot_that_talks_is_interrupted_and_its_reference_is_what_it_played(example, ego, check_conversation):
+    log, room, _ = await example("agent_pipecat").converse(ego)
     check_conversation(room, ego, 3.0)
     kinds = [what.split(":")[0] for _, what in log]
     again = ["the robot speaks", "the robot is silent"]  # Pipecat may deliver one frame taken before the interruption
@@ -51,24 +51,19 @@ def test_a_stereo_transport_that_the_filters_were_not_told_of_is_refused(end):
     assert (told.audio_in_channels, told.audio_out_channels) == (2, 2)
 
 
-def test_the_loudspeaker_s_sound_is_left_alone_and_noted_at_its_rate(filters):
-    async def speak():
-        await filters.params["audio_out_filter"].start(24_000)
-        return await filters.params["audio_out_filter"].filter(as_pcm16(NOISE))
-
-    assert asyncio.run(speak()) == as_pcm16(NOISE)
+async def test_the_loudspeaker_s_sound_is_left_alone_and_noted_at_its_rate(filters):
+    await filters.params["audio_out_filter"].start(24_000)
+    assert await filters.params["audio_out_filter"].filter(as_pcm16(NOISE)) == as_pcm16(NOISE)
     filters.duplex.end()
     assert filters.duplex.queued_s == pytest.approx(3200 / 24_000, abs=1e-3)
 
 
-def test_the_loudspeaker_s_sound_is_lowered_where_the_filter_asks_for_it_and_so_is_the_reference(filters, monkeypatch):
+async def test_the_loudspeaker_s_sound_is_lowered_where_the_filter_asks_for_it_and_so_is_the_reference(
+    filters, monkeypatch
+):
     monkeypatch.setattr(EgoFilter, "voice_gain", 0.25)
-
-    async def speak():
-        await filters.params["audio_out_filter"].start(16_000)
-        return await filters.params["audio_out_filter"].filter(as_pcm16(NOISE))
-
-    sent = from_pcm16(asyncio.run(speak()))
+    await filters.params["audio_out_filter"].start(16_000)
+    sent = from_pcm16(await filters.params["audio_out_filter"].filter(as_pcm16(NOISE)))
     faded = round(0.01 * 16_000)
     np.testing.assert_allclose(sent[faded:], 0.25 * NOISE[faded:], atol=1e-4)
     filters.duplex.end()
@@ -76,30 +71,23 @@ def test_the_loudspeaker_s_sound_is_lowered_where_the_filter_asks_for_it_and_so_
     assert filters.duplex.stats()["played_s"] == pytest.approx(sent.size / 16_000)
 
 
-def test_a_stereo_loudspeaker_that_nobody_told_of_is_noticed(caplog):
+async def test_a_stereo_loudspeaker_that_nobody_told_of_is_noticed(caplog):
     """Taken for one channel the reference would last twice as long as the speech: -2 dB instead of -27, without a word."""
     ears = EgoFilters(EgoFilter(engine="linear"))
-
-    async def speak():
-        for part in np.split(NOISE, 10):
-            await ears.params["audio_out_filter"].filter(as_pcm16(part, 2))
-
-    asyncio.run(speak())
+    for part in np.split(NOISE, 10):
+        await ears.params["audio_out_filter"].filter(as_pcm16(part, 2))
     ears.duplex.end()
     assert ears.duplex.queued_s == pytest.approx(3200 / 16_000, abs=1e-3)
     assert [record.levelname for record in caplog.records] == ["WARNING"] and "out_channels=2" in caplog.text
 
 
-def test_a_stereo_microphone_stays_stereo(filters):
-    async def hear():
-        await filters.params["audio_in_filter"].start(16_000)
-        return await filters.params["audio_in_filter"].filter(as_pcm16(NOISE, 2))
-
-    out = np.frombuffer(asyncio.run(hear()), "<i2").reshape(-1, 2)
+async def test_a_stereo_microphone_stays_stereo(filters):
+    await filters.params["audio_in_filter"].start(16_000)
+    out = np.frombuffer(await filters.params["audio_in_filter"].filter(as_pcm16(NOISE, 2)), "<i2").reshape(-1, 2)
     assert 2500 < len(out) < 3200 and out.any() and (out[:, 0] == out[:, 1]).all()
 
 
-def test_the_loopback_of_the_device_is_the_reference_where_it_is_named(talking):
+async def test_the_loopback_of_the_device_is_the_reference_where_it_is_named(talking):
     profile, sound = talking
     ears = EgoFilters(EgoFilter(profile, engine="linear"), in_channels=3, mic_channels=[1, 2], reference_channel=0)
     pcm = np.rint(sound * 32768).astype("<i2")
@@ -112,18 +100,7 @@ def test_the_loopback_of_the_device_is_the_reference_where_it_is_named(talking):
                 heard.append(from_pcm16(frame.audio, frame.num_channels))
             await self.push_frame(frame, direction)
 
-    async def listen():
-        over = asyncio.Event()
-        params = TransportParams(audio_in_enabled=True, audio_in_sample_rate=16_000, **ears.params)
-        worker = PipelineWorker(Pipeline([Microphones(sound, params, over), Listener()]))
-        runner = WorkerRunner(handle_sigint=False)
-        await runner.add_workers(worker)
-        running = asyncio.create_task(runner.run())
-        await over.wait()
-        await worker.cancel()
-        await running
-
-    asyncio.run(asyncio.wait_for(listen(), 120))
+    await pipeline(ears, sound, Listener())
     both, out = pcm.astype(np.float32) / 32768, np.concatenate(heard)
     expected = EgoFilter(profile, engine="linear").process(both[:, 1:], both[:, 0])
     np.testing.assert_allclose(out, expected[: out.size], atol=1 / 32768)
@@ -133,12 +110,10 @@ def test_the_loopback_of_the_device_is_the_reference_where_it_is_named(talking):
         EgoFilters(EgoFilter(engine="linear"), in_channels=3, mic_channels=[1, 2], reference_channel=3)
 
 
-def test_it_can_be_switched_off_while_it_runs(filters):
-    async def hear():
-        await filters.params["audio_out_filter"].process_frame(FilterEnableFrame(enable=False))
-        return await filters.params["audio_in_filter"].filter(as_pcm16(NOISE, 2))
-
-    np.testing.assert_array_equal(from_pcm16(asyncio.run(hear()), 2), from_pcm16(as_pcm16(NOISE)))
+async def test_it_can_be_switched_off_while_it_runs(filters):
+    await filters.params["audio_out_filter"].process_frame(FilterEnableFrame(enable=False))
+    out = await filters.params["audio_in_filter"].filter(as_pcm16(NOISE, 2))
+    np.testing.assert_array_equal(from_pcm16(out, 2), from_pcm16(as_pcm16(NOISE)))
 
 
 async def confidences(room_of, filters, switched_off_s):
@@ -160,6 +135,7 @@ async def confidences(room_of, filters, switched_off_s):
     return np.array(found)
 
 
+@pytest.mark.usefixtures("patient")
 @pytest.mark.parametrize("switched_off_s", [6.0, 2.0, 0.2], ids=["never", "while the human speaks", "before"])
 def test_the_voice_activity_is_the_human_s_also_while_the_filter_is_switched_off(room_of, switched_off_s):
     filters = EgoFilters(EgoFilter(room_of.PROFILE, engine="crnn"))
@@ -180,6 +156,7 @@ def test_a_voice_activity_that_would_not_notice_the_human_is_refused(settings):
         EgoFilters(EgoFilter(**settings)).vad()
 
 
+@pytest.mark.usefixtures("patient")
 @pytest.mark.parametrize("settings", [{"engine": "ss"}, {"budget_ms": 1e-6}], ids=["ss", "no hop within the budget"])
 def test_with_the_network_as_judge_the_human_is_noticed_whatever_the_engine_and_the_budget(room_of, settings):
     ego = EgoFilter(room_of.PROFILE, **settings, barge_in=BargeInSettings(judge="network"))
@@ -208,6 +185,23 @@ class Microphones(BaseInputTransport):
         self.over.set()
 
 
+async def pipeline(filters, sound, *processors):
+    """Let a transport of these filters hear the sound before the processors, the last of which may recognise it."""
+    over = asyncio.Event()
+    params = TransportParams(audio_in_enabled=True, audio_in_sample_rate=16_000, **filters.params)
+    worker = PipelineWorker(Pipeline([Microphones(sound, params, over), *processors]))
+    runner = WorkerRunner(handle_sigint=False)
+    await runner.add_workers(worker)
+    running = asyncio.create_task(runner.run())
+    await over.wait()
+    for _ in range(200):
+        if getattr(processors[-1], "segments", True):
+            break
+        await asyncio.sleep(0.02)
+    await worker.cancel()
+    await running
+
+
 class Recogniser(SegmentedSTTService):
     """Keeps what it is to transcribe."""
 
@@ -222,29 +216,12 @@ class Recogniser(SegmentedSTTService):
         yield TranscriptionFrame("words", "", "")
 
 
-def test_a_segmented_recogniser_gets_the_finished_turn_of_an_array(pair):
+async def test_a_segmented_recogniser_gets_the_finished_turn_of_an_array(pair):
     profile, sound = pair
     events = []
     filters = EgoFilters(EgoFilter(profile, engine="crnn"), in_channels=3, mic_channels=[1, 2], on_event=events.append)
     recogniser = Recogniser()
-
-    async def converse():
-        over = asyncio.Event()
-        params = TransportParams(audio_in_enabled=True, audio_in_sample_rate=16_000, **filters.params)
-        listens = VADProcessor(vad_analyzer=filters.vad())
-        worker = PipelineWorker(Pipeline([Microphones(sound, params, over), listens, filters.turns(), recogniser]))
-        runner = WorkerRunner(handle_sigint=False)
-        await runner.add_workers(worker)
-        running = asyncio.create_task(runner.run())
-        await over.wait()
-        for _ in range(200):
-            if recogniser.segments:
-                break
-            await asyncio.sleep(0.02)
-        await worker.cancel()
-        await running
-
-    asyncio.run(asyncio.wait_for(converse(), 120))
+    await pipeline(filters, sound, VADProcessor(vad_analyzer=filters.vad()), filters.turns(), recogniser)
     (turn,) = [event.turn for event in events if event.turn]
     assert recogniser.segments == [as_pcm16(turn.samples)]
     assert filters.duplex.ego.stats()["array"]["microphones"] == 2

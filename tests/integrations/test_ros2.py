@@ -1,5 +1,6 @@
 """The node /edgefilter over the real middleware, with messages as ROS 2 nodes name them; and recordings of theirs."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -89,7 +90,7 @@ class Robot:
     """The nodes around: a microphone in a simulated room, a voice, and those who listen; with ROS's usual quality of service."""
 
     def __init__(self, domain):
-        self.participant = DomainParticipant(domain)
+        self.domain, self.participant = domain, DomainParticipant(domain)
         reliable = Qos(Policy.Reliability.Reliable(duration(seconds=1)), Policy.History.KeepLast(200))
         lossy = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(200))
         self.mic = DataWriter(self.participant, Topic(self.participant, "rt/audio", Audio), qos=lossy)
@@ -133,30 +134,30 @@ class Robot:
         return np.frombuffer(b"".join(sound), "<i2") / 32768, told
 
 
-def node(domain, folder, *more, profile=PROFILE):
-    """The command as it is typed."""
-    words = ("ros2", "--profile", profile, "--domain", domain, *more)
+@contextlib.contextmanager
+def node(robot, folder, *more, profile=PROFILE, end=signal.SIGTERM):
+    """The command as it is typed, found by the robot and ended by this signal; said: what it then had said."""
+    words = argv("ros2", "--profile", profile, "--domain", robot.domain, *more)
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    process = subprocess.Popen(
-        argv(*words), stderr=subprocess.PIPE, text=True, cwd=folder, env=environment
-    )  # fmt: skip
-    assert "node /edgefilter" in process.stderr.readline()
-    return process
+    process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, cwd=folder, env=environment)
+    try:
+        assert "node /edgefilter" in process.stderr.readline()
+        robot.wait_for_node()
+        yield process
+    finally:
+        process.send_signal(end)
+        _, process.said = process.communicate(timeout=20)
+    assert process.returncode == (-end if end == signal.SIGKILL else 0)
 
 
 @pytest.mark.slow
 def test_the_node_gives_the_human_and_barge_in_also_after_it_was_killed_and_started_again(tmp_path, room_of):
     robot = Robot(domain=87)
-    for number, asks in ((signal.SIGKILL, False), (signal.SIGTERM, True)):
-        process = node(87, tmp_path, *(("--ask-db", 12) if asks else ()))
-        try:
-            robot.wait_for_node()
+    for end, asks in ((signal.SIGKILL, False), (signal.SIGTERM, True)):
+        with node(robot, tmp_path, *(("--ask-db", 12) if asks else ()), end=end):
             sound, told = robot.converse(room_of, paced=asks)
             gains = [round(message.data, 2) for message in received(robot.gains)]
             reports = [message.status[0] for message in received(robot.reports)]
-        finally:
-            process.send_signal(number)
-            assert process.wait(20) == (0 if number == signal.SIGTERM else -number)
         assert sound.size > 5.5 * RATE
         assert told and told[0][1] and 3.0 < told[0][0] < 4.0, told
         assert gains[:2] == ([0.25, 1.0] if asks else []), gains  # what waits at the loudspeaker cannot be lowered
@@ -177,11 +178,8 @@ def test_of_an_array_the_named_channels_are_its_microphones_and_the_human_is_one
     pcm = np.rint(sound * 32768).astype("<i2")
     reference = ("--reference-channel", 0) if loopback else ("--reference-channels", 1)
     words = ("--channels", 3, "--mic-channels", "1,2", *reference, "--engine", "ss")
-    robot = Robot(domain=89)
-    process = node(89, tmp_path, *words, profile=tmp_path / "pair.npz")
-    try:
-        robot.wait_for_node()
-        heard = b""
+    robot, heard = Robot(domain=89), b""
+    with node(robot, tmp_path, *words, profile=tmp_path / "pair.npz"):
         for at in range(0, len(pcm) - FRAME, FRAME):
             robot.mic.write(Audio(data=list(pcm[at : at + FRAME].tobytes())))
             time.sleep(0.005)
@@ -190,9 +188,6 @@ def test_of_an_array_the_named_channels_are_its_microphones_and_the_human_is_one
         while len(heard) <= 2 * 2.5 * RATE and time.monotonic() < until:  # a busy machine is behind
             time.sleep(0.05)
             heard += b"".join(bytes(message.data) for message in received(robot.human))
-    finally:
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(20) == 0
     human = np.frombuffer(heard, "<i2") / 32768
     assert 2.5 * RATE < human.size < len(pcm)
     ego = EgoFilter(profile, engine="ss", barge_in=BargeInSettings(judge="network"))
@@ -203,9 +198,7 @@ def test_of_an_array_the_named_channels_are_its_microphones_and_the_human_is_one
 
 def test_a_message_that_is_no_sound_is_a_line_and_the_node_goes_on(tmp_path):
     robot = Robot(domain=88)
-    process = node(88, tmp_path)
-    try:
-        robot.wait_for_node()
+    with node(robot, tmp_path, end=signal.SIGINT) as process:
         robot.mic.write(Audio(data=[1, 2, 3]))
         robot.mic.write(Audio(data=[0] * 4096))
         end = time.monotonic() + 20
@@ -213,10 +206,7 @@ def test_a_message_that_is_no_sound_is_a_line_and_the_node_goes_on(tmp_path):
             assert time.monotonic() < end
             time.sleep(0.05)
         assert len(heard[0].data) > 0
-    finally:
-        process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=20)
-    assert "found 3 bytes, expected whole 16-bit samples" in said and process.returncode == 0
+    assert "found 3 bytes, expected whole 16-bit samples" in process.said
 
 
 @pytest.mark.parametrize(
@@ -271,11 +261,9 @@ def test_a_recording_becomes_the_files_that_every_command_takes(recording, tmp_p
         at = int(np.argmax(np.correlate(mic, sounds["/mic"][:4000] / 32768, "valid")))
         assert at < 0.02 * RATE
         np.testing.assert_allclose(mic[at : at + 4 * RATE], sounds["/mic"] / 32768, atol=1e-4)
-        late = [
-            int(np.argmax(np.correlate(reference, sounds["/tts"][at : at + 4000] / 32768, "valid"))) - at
-            for at in (0, 32000)
-        ]
-        assert all(abs(each) < 0.02 * RATE for each in late), late  # the messages' jitter
+        for at in (0, 32000):
+            late = int(np.argmax(np.correlate(reference, sounds["/tts"][at : at + 4000] / 32768, "valid"))) - at
+            assert abs(late) < 0.02 * RATE  # the messages' jitter
 
 
 def test_a_topic_that_is_not_there_is_named_with_those_that_are(recording, tmp_path, capsys):

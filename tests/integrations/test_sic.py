@@ -16,6 +16,7 @@ from edgefilter import Profile
 from edgefilter.calibration.calibrate import cross_density
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.dsp.resample import Resampler
+from edgefilter.integrations import sic
 from edgefilter.profile.array import ArrayCalibration
 from edgefilter.types import SAMPLE_RATE as RATE
 from tests.program import ROOT
@@ -33,7 +34,10 @@ class Cloud:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
         own = {"DB_IP": "127.0.0.1", "DB_PORT": str(self.port), "DB_PASS": "secret", "SIC_IP": "127.0.0.1"}
-        self.environment = {**os.environ, **own, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+        self.environment = {**os.environ, **own, "PYTHONPATH": f"{folder}:{ROOT}", "OMP_NUM_THREADS": "1"}
+        # the room's time is not the machine's: a slow machine is no microphone that was off
+        patient = "from edgefilter.integrations import duplex\nduplex.WAITED_S = 1e9\n"
+        (folder / "sitecustomize.py").write_text(patient)
         self.processes = []
 
     def start(self, *words, **more):
@@ -89,25 +93,13 @@ def cloud(tmp_path):
     cloud.end()
 
 
-def in_time(cloud, *words, component=()):
-    """A component and what a program has heard of it; of both anew where the machine was too slow, so that messages came late."""
-    for _ in range(4):
-        started = cloud.component(*component)
-        sound, told = cloud.run_program(*words)
-        kinds = [kind for kind, *_ in told]
-        if "overloaded" not in kinds and kinds.count("realigned") == 1:
-            return started, sound, told
-        cloud.stop(started)
-    raise AssertionError(f"four runs were late: {told}")
-
-
 @pytest.mark.slow
 def test_a_program_gets_the_human_and_is_told_when_he_interrupts_also_after_the_component_died(cloud, room_of):
     cloud.redis()
-    first, *heard = in_time(cloud)
-    check(*heard, room_of)
-    cloud.stop(first)
-    check(*in_time(cloud)[1:], room_of)
+    for _ in range(2):
+        component = cloud.component()
+        check(*cloud.run_program(), room_of)
+        cloud.stop(component)
 
 
 @pytest.mark.slow
@@ -119,7 +111,8 @@ def test_the_four_microphones_of_a_robot_s_head_are_one_array(cloud, room_of):
     four = replace(robot, array=ArrayCalibration(further, cross_density(heard.astype(np.float32))))
     four.save(cloud.folder / "four.npz")
     cloud.redis()
-    _, sound, told = in_time(cloud, "four", component=(cloud.folder / "four.npz", "--channels", "4"))
+    cloud.component(cloud.folder / "four.npz", "--channels", "4")
+    sound, told = cloud.run_program("four")
     check(Resampler(48_000, RATE).push(sound.astype(np.float32), last=True), told, room_of)
 
 
@@ -131,7 +124,8 @@ def check(sound, told, room_of):
     both = slice(3 * RATE, round(5.4 * RATE))
     human = room_of.HUMAN[: both.stop - both.start]
     assert max(si_sdr(sound[both], np.roll(human, shift)) for shift in (0, 1)) > 3  # before: -23 dB
-    assert not [kind for kind, *_ in told if kind.startswith(("reference", "robot", "rate"))]
+    kinds = [kind for kind, *_ in told]
+    assert kinds.count("realigned") == 1 and not [k for k in kinds if k.startswith(("reference", "robot", "rate"))]
 
 
 @pytest.mark.slow
@@ -142,7 +136,6 @@ def test_without_a_server_it_is_one_line(cloud):
     assert done.returncode == 1 and len(said) == 1 and "Redis" in said[0], done.stderr
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -151,7 +144,8 @@ def test_without_a_server_it_is_one_line(cloud):
         (["--engine", "linear", "--channels", "0"], "channels is 0, expected at least 1"),
     ],
 )
-def test_what_cannot_be_a_component_is_one_line(cloud, words, said):
-    words = ("-m", "edgefilter.integrations.sic", *words)
-    done = subprocess.run([sys.executable, *words], env=cloud.environment, capture_output=True, text=True, timeout=100)
-    assert done.returncode == 1 and len(done.stderr.splitlines()) == 1 and said in done.stderr
+def test_what_cannot_be_a_component_is_one_line(words, said, monkeypatch, capsys):
+    monkeypatch.setattr(sic, "_default", dict(sic._default))
+    assert sic.main(words) == 1
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1 and said in told
