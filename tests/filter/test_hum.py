@@ -2,11 +2,9 @@
 
 import numpy as np
 import pytest
-import soundfile
 
 from edgefilter import enhance
 from edgefilter.dsp.metrics import si_sdr
-from edgefilter.filter.budget import DEMO
 from edgefilter.filter.hum import Hum
 from edgefilter.types import SAMPLE_RATE
 from tests.program import demo
@@ -60,7 +58,7 @@ def test_what_is_no_hum_stays_bit_for_bit(name):
         "tone": tones(47.0, 155.0, 440.0),
         "offset": np.full(SECONDS.size, 0.03, np.float32),
     }
-    x = known[name] if name in known else soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0]
+    x = known[name] if name in known else demo(name)[0]
     left, found = through(x)
     assert not found
     np.testing.assert_array_equal(left, x[: left.size])

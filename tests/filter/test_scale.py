@@ -18,7 +18,7 @@ SAME_DB = 0.5
 
 @pytest.mark.slow
 @pytest.mark.parametrize("known", [False, True], ids=["cold", "profile"])
-@pytest.mark.parametrize("engine", ["linear", "ss", "crnn"])
+@pytest.mark.parametrize("engine", ["ss", "crnn"])
 def test_neither_the_level_of_the_reference_nor_that_of_the_microphone_changes_the_answer_or_when_a_human_is_noticed(
     engine, known
 ):

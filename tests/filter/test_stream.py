@@ -92,9 +92,8 @@ def test_a_found_reference_is_an_event_and_stands_in_the_stats():
     ego = EgoFilter(engine="linear")
     ego.process(mic, ref)
     kinds = [event.kind for event in ego.events()]
-    assert (
-        kinds.count("realigned") == 1 and set(kinds) <= {"realigned", "overloaded"} and ego.events() == []
-    )  # a busy machine may add the latter
+    # a busy machine may add the latter
+    assert kinds.count("realigned") == 1 and set(kinds) <= {"realigned", "overloaded"} and ego.events() == []
     assert ego.stats()["alignment"]["delay_samples"] == pytest.approx(900, abs=16)  # 1 ms, the reach of the aligner
 
 
@@ -104,9 +103,8 @@ def test_enhance_lowers_a_purely_linear_echo_by_20_db():
     mic = np.concatenate((np.zeros(900, np.float32), 0.5 * ref[:-900]))
     out = enhance(mic, ref, engine="linear")
     last = slice(-32_000, None)
-    assert (
-        10 * np.log10(np.mean(out[last] ** 2) / np.mean(mic[last] ** 2)) < -20
-    )  # a plain delay; 26 dB and more were seen
+    # a plain delay; 26 dB and more were seen
+    assert 10 * np.log10(np.mean(out[last] ** 2) / np.mean(mic[last] ** 2)) < -20
 
 
 @pytest.mark.parametrize("engine", ["bypass", "linear"])
