@@ -59,6 +59,9 @@ class FakeClock:
     def __call__(self):
         return self.now
 
+    def wait(self, seconds):
+        self.now += seconds
+
 
 class Slow(Bypass):
     """The microphone after cost_s more of the given clock."""
@@ -166,12 +169,8 @@ class Twofold(Bypass):
 
 def test_both_sounds_fade_to_an_engine_that_has_one():
     engine = Fallback((Twofold(), Quiet()))
-    state, (mic, *rest) = (
-        engine.initial_state(),
-        np.random.default_rng(0).standard_normal((6, engine.stft.bins)).astype(np.complex64),
-    )
-    frame = Frame(mic, *rest)
-    engine.wanted, found = 1, []
+    frame = Frame(*np.random.default_rng(0).standard_normal((6, engine.stft.bins)).astype(np.complex64))
+    state, engine.wanted, found = engine.initial_state(), 1, []
     for _ in range(DOWN):
         output, state = engine.step(frame, state)
         found.append([np.vdot(frame.mic, sound).real / np.vdot(frame.mic, frame.mic).real for sound in output.sounds])
@@ -208,11 +207,7 @@ def test_cheaper_engines_take_the_stft_of_the_best():
 
 def overloaded_stream(cost_s, budget_ms=8.0):
     clock = FakeClock()
-
-    def wait(seconds):
-        clock.now += seconds
-
-    slow = Slow(wait, cost_s)
+    slow = Slow(clock.wait, cost_s)
     fallback = Fallback((slow, Bypass(), Quiet()))
     return slow, Stream(fallback, None, Stepping(HOP, fallback, budget_ms, clock))
 
@@ -281,11 +276,7 @@ def test_patience_is_short_again_after_an_engine_has_proved_itself():
 
 def test_the_last_engine_too_slow_is_said_once():
     clock = FakeClock()
-
-    def wait(seconds):
-        clock.now += seconds
-
-    stream = Stream(Slow(wait, 0.020), None, Stepping(HOP, None, 8.0, clock))
+    stream = Stream(Slow(clock.wait, 0.020), None, Stepping(HOP, None, 8.0, clock))
     assert [kind for kind, _ in feed(stream, 10.0)] == ["overloaded"]
     assert stream.stepping.stats()["missed_deadlines"] == 625
 
