@@ -2,21 +2,18 @@
 
 import numpy as np
 import pytest
-import soundfile
 
 from edgefilter import EgoFilter, Profile
 from edgefilter.engines import create
 from edgefilter.engines.combined import Fallback, fallbacks, with_network_as_judge
 from edgefilter.filter.budget import DEMO
 from edgefilter.filter.stream import Stream
+from tests import program
 from tests.as_before import levels_db, same_as_before
 
 
 def demo() -> tuple[np.ndarray, np.ndarray, Profile]:
-    mic, ref = (
-        soundfile.read(DEMO / f"{name}.flac", dtype="float32")[0][: 10 * 16000] for name in ("mic", "reference")
-    )
-    return mic, ref, Profile.load(DEMO / "profile.npz")
+    return *(x[: 10 * 16000] for x in program.demo("mic", "reference")), Profile.load(DEMO / "profile.npz")
 
 
 @pytest.mark.parametrize("engine", ["paper-ss", "ss", "crnn"])
@@ -51,14 +48,8 @@ def test_in_turn() -> None:
     """From the best to the cheapest, back, and back again before the crossfade has ended."""
     mic, ref, profile = demo()
     fallback = Fallback(fallbacks(create("crnn", profile), profile))
-    wanted = {
-        40: len(fallback.engines) - 1,
-        80: 0,
-        130: len(fallback.engines) - 1,
-        132: 0,
-        160: 1,
-        170: len(fallback.engines) - 1,
-    }
+    last = len(fallback.engines) - 1
+    wanted = {40: last, 80: 0, 130: last, 132: 0, 160: 1, 170: last}
     hop, out = fallback.stft.hop, []
     stream = Stream(fallback, profile)
     for count, at in enumerate(range(0, ref.size, hop)):

@@ -16,11 +16,8 @@ from tests.conformance import robot
 DATA = Path(__file__).parents[1] / "data"
 MODELS = {"crnn": DATA / "crnn.onnx", "paper-crnn": DATA / "paper_crnn.onnx"}
 """Networks of the smallest size; tests/data/make_models.py makes them."""
-CASES = [
-    (name, check)
-    for name in engines.ENGINES
-    for check in (conformance.CLIP_CHECKS if name == "paper-crnn" else conformance.CHECKS)
-]
+CHECKS = {"paper-crnn": conformance.CLIP_CHECKS}
+CASES = [(name, check) for name in engines.ENGINES for check in CHECKS.get(name, conformance.CHECKS)]
 
 
 @pytest.mark.parametrize("name, check", CASES, ids=lambda value: getattr(value, "__name__", value))

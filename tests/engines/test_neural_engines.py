@@ -22,7 +22,7 @@ from edgefilter.filter.stream import Stream
 from edgefilter.profile.data import LEARNED, Profile
 from edgefilter.types import Frame
 from tests import conformance
-from tests.program import DEMO, ROOT, argv, demo
+from tests.program import DEMO, ROOT, demo, here, one_line
 
 DATA = Path(__file__).parents[1] / "data"
 EDGE, PAPER = DATA / "crnn.onnx", DATA / "paper_crnn.onnx"
@@ -58,8 +58,9 @@ def test_crnn_answers_what_onnxruntime_answers_for_the_same_frames():
         spectra = scale * error, scale * mic, of_reference * reference, scale * echo
         pairs = [np.stack((x.real, x.imag), axis=-1)[None] for x in spectra]
         powers = [scale**2 * noise[None], scale**2 * residual[None]]
+        names = [slot.name for slot in session.get_inputs()]
         listen, recognise, probability, *theirs = session.run(
-            None, dict(zip([slot.name for slot in session.get_inputs()], pairs + powers + theirs, strict=True))
+            None, dict(zip(names, pairs + powers + theirs, strict=True))
         )
         for sound, found in ((output.spectrum, listen), (output.recognise, recognise)):
             np.testing.assert_array_equal(sound, np.float32(1 / scale) * (found[0, :, 0] + 1j * found[0, :, 1]))
@@ -183,10 +184,7 @@ def test_denormal_numbers_survive_in_the_thread_of_the_caller_and_in_those_it_st
         ({"hop": "512"}, "unusable metadata.*inverted"),
         ({"n_fft": "1024"}, r"inputs .*error \[1, 257, 2\].*wants.*error \[1, 513, 2\]"),
         ({"states": "[]"}, "inputs .*state_0"),
-        (
-            {"states": '[["state_0", [1, 6, 9]]]'},
-            r"wants.*state_0 \[1, 6, 9\]",
-        ),
+        ({"states": '[["state_0", [1, 6, 9]]]'}, r"wants.*state_0 \[1, 6, 9\]"),
         ({"states": "nonsense"}, "unusable metadata"),
     ],
 )
@@ -224,12 +222,8 @@ def test_the_model_comes_from_the_option_then_the_variable_then_the_package(tmp_
 def test_the_packages_int8_file_is_of_the_same_training_as_the_exact_one():
     exact, used = Crnn(Path(__file__).parents[2] / "models/crnn.onnx").model, Crnn().model
     assert used.path.name == "crnn_int8.onnx"
-    assert (used.training, used.figures, used.states, used.stft) == (
-        exact.training,
-        exact.figures,
-        exact.states,
-        exact.stft,
-    )
+    for name in ("training", "figures", "states", "stft"):
+        assert getattr(used, name) == getattr(exact, name), name
 
 
 @pytest.mark.slow
@@ -276,9 +270,8 @@ def test_paper_crnn_masks_the_mixtures_magnitude_and_keeps_its_phase():
     mic, ref = (np.stack([spectrum(rng, bins) for _ in range(7)]) for _ in range(2))
     nothing = np.zeros(bins, np.float32)
     answer = np.stack(engine.answer([Frame(m, r, m, m, nothing, nothing) for m, r in zip(mic, ref)]))
-    mask = onnx_session.open_session(PAPER).run(
-        None, {"mic_magnitude": np.abs(mic)[None], "reference_magnitude": np.abs(ref)[None]}
-    )[0][0]
+    heard = {"mic_magnitude": np.abs(mic)[None], "reference_magnitude": np.abs(ref)[None]}
+    mask = onnx_session.open_session(PAPER).run(None, heard)[0][0]
     assert mask.std() > 1e-4
     np.testing.assert_array_equal(answer, mask * mic)
 
@@ -295,31 +288,24 @@ def test_paper_crnn_refuses_a_recording_that_is_too_long_before_it_fills_the_mem
 
 
 @pytest.mark.slow
-def test_the_command_line_takes_a_model_and_reports_it(tmp_path):
+def test_the_command_line_takes_a_model_and_reports_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     mic, ref = conformance.conversation()
-    soundfile.write(tmp_path / "mic.wav", mic, 16000, "FLOAT")
-    soundfile.write(tmp_path / "ref.wav", ref, 16000, "FLOAT")
+    soundfile.write("mic.wav", mic, 16000, "FLOAT")
+    soundfile.write("ref.wav", ref, 16000, "FLOAT")
 
     def run(engine: str, model: Path) -> subprocess.CompletedProcess:
-        words = [
-            *"run --input mic.wav --reference ref.wav --engine".split(),
-            engine,
-            "--model",
-            str(model),
-            "--output",
-            "out.wav",
-        ]
-        return subprocess.run(argv(*words), cwd=tmp_path, capture_output=True, text=True)
+        return here(
+            *"run --input mic.wav --reference ref.wav --output out.wav --engine".split(), engine, "--model", model
+        )
 
     done = run("crnn", EDGE)
     assert done.returncode == 0 and "algorithmic latency 32 ms" in done.stderr, done.stderr
-    np.testing.assert_allclose(
-        soundfile.read(tmp_path / "out.wav")[0], enhance(mic, ref, engine="crnn", model=EDGE), atol=2**-15
-    )
+    expected = enhance(mic, ref, engine="crnn", model=EDGE)
+    np.testing.assert_allclose(soundfile.read("out.wav")[0], expected, atol=2**-15)
     done = run("paper-crnn", PAPER)
     assert done.returncode == 0 and "answers at the end of the recording" in done.stderr, done.stderr
-    refused = run("crnn", PAPER)
-    assert refused.returncode == 1 and refused.stderr.count("\n") == 1 and "expected edgefilter-crnn" in refused.stderr
+    one_line(run("crnn", PAPER), 1, "expected edgefilter-crnn")
 
 
 def test_a_model_needs_its_engine_named():
