@@ -31,7 +31,8 @@ class Output(NamedTuple):
 class Robot(NamedTuple):
     """A robot that lowers its voice by ask_db when the filter asks for it.
 
-    echo: (n,), its voice as the microphone recorded it, or `softened`; late: delay of the echo behind the reference, samples.
+    echo: (n,), its voice as the microphone recorded it or, where a lower voice distorts less, what `softened` returns. late: delay
+    of the echo behind the reference, samples.
     file: where to write what it plays (left) and what its microphone hears (right). device: what processes the microphone's sound.
     """
 
@@ -52,7 +53,7 @@ class Behind:
         return getattr(self._ego, name)
 
     def process(self, mic: Samples, ref: Samples) -> Samples:
-        """As of the filter, and mic (n,) holds afterwards what the device made of it."""
+        """Like the filter's `process`; mic (n,) is overwritten with the device's output."""
         mic[:] = np.clip(self._device(mic)[0], -1.0, 1.0)
         return self._ego.process(mic, ref)
 

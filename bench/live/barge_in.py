@@ -3,18 +3,18 @@
 Interruptions: --count conversations of bench/simulate/conversations.py, kinds paper and live in turn. The loop is
 closed: from REACTION_S after the event speech_started the robot says nothing more (or 10 dB less), the rest of its speech
 is never played, the microphone is recorded anew with what is left of it, and the filter runs over that; what was handed
-to the loudspeaker before is still in the microphone, as late as that robot's playback lags. Compared with: open loop (the
+to the loudspeaker before is still heard, for as long as that robot's playback lags. Compared with: open loop (the
 robot talks on), a microphone that is muted while the robot speaks, an oracle that has silence at the human's first
-sound. The recogniser gets the human's span of what each of them leaves.
+sound. The recogniser gets the output of each of them over the span in which the human speaks.
 
 Backchannels: the same scenes, with a short word or a cough in the place of the interruption. False stops: the robot
-alone for --minutes of its speech (--alone: its voices), in new rooms all the time, half of them with loudspeakers of
-strong distortion and half without a calibration, and recordings of a real loudspeaker (--real) that nothing was tuned
-on, lowered as a whole where the robot asks. --ask-db: interruptions and false stops with a robot that lowers its voice
-where the filter asks for it; a simulated loudspeaker then distorts less, and a microphone that processes its sound
-(--microphone) does so with what it hears by then. --sound: what each of them plays that is interrupted and calibrated, on the left, and what
-its microphone hears. Rows are kept in --cache as they are made: a run that was cut off, or is asked for more minutes,
-goes on there.
+alone for --minutes of its speech (--alone: folders of its clips), each minute another robot in another room, half of them
+with loudspeakers of strong distortion and half without a calibration, and recordings of a real loudspeaker (--real) that
+nothing was tuned on. --ask-db: by how much the robot lowers its voice while the filter asks for it; a simulated loudspeaker
+then distorts less, a microphone that processes its sound (--microphone) processes the lower voice, and a recording is
+lowered as a whole. --sound: a file for each calibrated robot that is interrupted, what it plays on the left and what its
+microphone hears on the right. Rows are kept in --cache as they are made: a run that was cut off, or is asked for more
+minutes, goes on there.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ from edgefilter.types import SAMPLE_RATE, Samples
 
 KINDS = ("paper", "live")
 Hear = Callable[..., Output]
-"""`listen` to what a scene's microphone and reference are, with an engine, behind the scene's device."""
+"""Runs `listen` on a scene's microphone, through its device, and the reference, with one engine."""
 REACTION_S, FADE_S = 0.05, 0.02
 """From the event until the robot's player is told, and how long its fade takes."""
 DUCK_DB = -10.0
@@ -93,7 +93,10 @@ def measure(
     scene: Scene, engine: str, recogniser: Recogniser | None, ask_db: float, file: Path | None = None,
     device: Processing | None = None,
 ) -> dict:  # fmt: skip
-    """Ready for JSON: noticed with a calibration and without, words under each policy, backchannels. device: behind the scene's microphone."""
+    """Ready for JSON: when the interruption is noticed, calibrated and cold, wrong words under each of POLICIES, how long backchannels last.
+
+    device: the processing behind the scene's microphone.
+    """
     signals, meta = scene.signals, scene.meta
     ref, onset = signals["ref"], first_sound(signals["clean"].astype(np.float32))
     sweep, *recorded = (signals[name] for name in CALIBRATION)

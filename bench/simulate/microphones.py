@@ -16,7 +16,7 @@ from scipy import signal
 from bench.simulate.simulated_robot import RATE, Array, Rng
 
 FRAME = 128
-"""8 ms, of gains."""
+"""8 ms: gains are computed once for each frame."""
 EDGES_HZ = (250, 500, 1000, 2000, 3000, 4500, 6000)
 """Between the bands of the noise suppression, about two critical bands each."""
 TAPS = 255
@@ -34,7 +34,7 @@ Signals = dict[str, Array]
 class Processing:
     """A device that suppresses noise and controls its gain.
 
-    depth_db: by how much it lowers noise at most. ratio: decibels by which it turns down what is a decibel louder than mean_db.
+    depth_db: greatest attenuation of noise. ratio: fall of the gain, dB, for each dB of level above mean_db, and rise below it.
     """
 
     depth_db: float
@@ -46,13 +46,13 @@ class Processing:
         return cls(rng.uniform(8, 15), rng.uniform(0.4, 0.8), 10 * math.log10(np.mean(np.square(mic, dtype=float))))
 
     def whole(self, mic: Array, *parts: Array) -> list[Array]:
-        """What a device that is switched on makes of a recording (n,), not late, and of its parts under the same gains."""
+        """Process a whole recording (n,) from a fresh state and take the device's delay out; the result, and `parts` under the same gains."""
         sounds = [np.pad(x, (0, LATE)) for x in (mic, *parts)]
         return [x[LATE:] for x in Stream(self)(*sounds)]
 
 
 class Stream:
-    """One run of such a device, block by block: one gain of each band against noise, and one of all against the level."""
+    """One run of a `Processing` device, block by block: a gain for each band suppresses noise, one for all bands controls the level."""
 
     def __init__(self, device: Processing) -> None:
         self._device = device
@@ -62,7 +62,10 @@ class Stream:
         self._power = self._level = self._suppressed = self._gain = self._floor = np.zeros(0)
 
     def __call__(self, mic: Array, *parts: Array) -> list[Array]:
-        """The sound (n,) that comes out, LATE, and its parts; n is a multiple of FRAME but for the last block."""
+        """Process a block (n,): the output, and `parts`, which mic is the sum of, under the same gains; all are late by LATE samples.
+
+        n is a multiple of FRAME, except in the last block.
+        """
         sounds = np.stack([np.pad(x.astype(float), (0, -x.size % FRAME)) for x in (mic, *parts)])
         if not self._before.size:
             self._before = np.zeros((len(sounds), TAPS - 1))
@@ -89,7 +92,7 @@ class Stream:
 
 
 def processed(rng: Rng, signals: Signals, voice: Array) -> Signals:
-    """A device that processes what it hears; the human is what it makes of the human."""
+    """The signals as a device that processes its sound delivers them; the human's part, too, is that after processing."""
     device = Processing.draw(rng, signals["mic"])
     found = {name: device.whole(signals[name])[0] for name in ("sweep_mic", "fan_only")}
     heard = device.whole(*(signals[name] for name in ("mic", "clean", "fan")))
@@ -104,7 +107,10 @@ def _power(x: Array) -> Array:
 
 
 def _smooth(values: Array, seconds: float, before: Array) -> tuple[Array, Array]:
-    """Values (rows, frames) behind those that ended in `before` (rows, 1), or in none yet (0,): the last one, and all of them."""
+    """Values (rows, frames), smoothed over `seconds` and begun from the last smoothed value `before`, (rows, 1), or (0,) at first.
+
+    Returns the last smoothed value and all of them.
+    """
     kept = math.exp(-FRAME / RATE / seconds)
     start = kept * (before if before.size else values[:, :1])
     found = signal.lfilter([1 - kept], [1, -kept], values, axis=1, zi=start)[0]

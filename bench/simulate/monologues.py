@@ -44,7 +44,7 @@ def speak(
     rng: Rng, robot: Robot, repertoire: Iterator[Array], speech_s: float, room: Room, lag: int, volume_db: float = 0.0,
     ppm: float = 0.0, ask_db: float = 0.0,
 ) -> tuple[Array, Array, Array, list[slice]]:  # fmt: skip
-    """Make speech_s seconds of speech: the reference, its echo, that of the voice lowered by ask_db, (n,) each, and where each utterance lies.
+    """Make speech_s seconds of speech: the reference, its echo and the echo of the voice lowered by ask_db, (n,) each; each utterance's span.
 
     The echoes are those before the microphone's gain.
     """
@@ -71,8 +71,9 @@ def speak(
 class Monologue:
     """One robot in one room, from the filter's first moment on.
 
-    ref, mic: reference and microphone, (n,) float32. echo: the robot's part of mic, or `softened`. late: samples by which the
-    echo comes after the reference. device: what processes what the microphone hears; it has processed the calibration. start:
+    ref, mic: reference and microphone, (n,) float32. echo: the robot's part of mic; of one that can lower its voice what
+    `softened` returns. late: samples by which the echo comes after the reference. device: the processing behind the microphone, which
+    mic still lacks and the calibration has. start:
     "calibrated" where the filter gets the calibration (sweep, its recording, the fan's noise), "cold" where it does not.
     said: the clips in order, with their durations in seconds.
     """
@@ -93,7 +94,7 @@ class Monologue:
 def make_monologue(
     seed: int, index: int, voice: str, clips: Iterator[Clip], speech_s: float, ask_db: float = 0.0, microphone: str | None = None
 ) -> Monologue:  # fmt: skip
-    """Simulate monologue number `index` of this seed, ask_db: of a robot that lowers its voice. Whatever the microphone, all else of it is the same.
+    """Simulate monologue number `index` of this seed. ask_db: by how much it can lower its voice. The choice of microphone changes nothing else.
 
     The index decides kind of room, distortion and start, each in turn, and whether the clocks differ, for eight monologues
     yes and for eight no. The microphone's gain is the largest at which neither a sweep in that room has a peak above 0.3 of

@@ -289,6 +289,9 @@ def with_distortion(robot: Robot, played: Array, response: Array, nl_db: float) 
 
 
 def softened(echo: Array, softer: Array, ask_db: float) -> Array:
-    """The echo (n,) that a linear loudspeaker would have if it lost as much from there to `softer`, the same voice lowered by ask_db, (n,)."""
+    """What to use in place of `echo` (n,) where a gain is to stand for a voice lowered by ask_db, whose echo `softer` (n,) distorts less.
+
+    A gain of -ask_db takes off it what the microphone loses from `echo` to `softer`; with ask_db 0 it is `echo`.
+    """
     lower = 10 ** (-ask_db / 20)
     return ((echo - softer) / (1 - lower) if ask_db else echo).astype(np.float32)

@@ -61,14 +61,14 @@ class Aligned(NamedTuple):
     1e-6 samples per sample. confidence: probability that the delay is right, 0 to 1. realigned: the delay was switched
     discontinuously in this hop. state: of the utterance that may be heard now. "idle": nothing of the reference can be
     audible. "announced": it is waited for, and may begin at any time or never. "begun": it has begun and is not found yet;
-    delay is the one of before, or nan. "unfound": as "begun", but it should have been heard by now, whatever its lag.
+    delay is that of the utterance before, or nan. "unfound": as "begun", but it should have been heard by now, whatever its lag.
     "coarse": no sharp arrival was found yet, the delay is known to within 25 ms; the reference is read 25 ms early. "lost":
-    it was found, but the last looks did not see it, beside a loud human or after a jump; delay is carried on, with its
-    drift. "locked": its delay is followed. at_any_lag: what is heard may be an utterance at a lag that nobody knows: it was
-    not found so far, and no delay is known, or the one of before was refuted; or it is too loud for anybody else
-    (FirstSounds). wait: samples by which the microphone must be delayed to fit the reference, WAIT at most.
-    past: the last seconds of both channels. belief: probabilities of the lags
-    after the latest searches, in a hop in which one of them has ended; else None.
+    it was found, but the latest searches missed it, since a human is loud or the lag jumped; delay is extrapolated with its
+    drift. "locked": its delay is followed. at_any_lag: what is heard may be an utterance at an unknown lag: it was not found so
+    far, and no delay is known, or that of the utterance before was refuted; or FirstSounds finds it too loud to be anybody but
+    the robot. wait: samples by which the microphone must be delayed because the echo comes too early for the reference, WAIT
+    at most. past: the last seconds of both channels. belief: probabilities of the lags after the latest searches, in a hop in
+    which one of them has ended; else None.
     """
 
     reference: Samples

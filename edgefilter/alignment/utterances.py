@@ -40,7 +40,7 @@ LONGEST = SAMPLE_RATE // 4
 """Longest muting, samples, once the robot has been heard: it limits what a human as loud as the robot can lose. A reference that
 rises out of digital silence counts as a voice for as long, before its level has varied."""
 RECENT = SAMPLE_RATE // 2
-"""Samples for which somebody else who was loud may pause within a sentence: after half of it a real human as loud as the robot lost 2 dB."""
+"""Samples for which somebody else who was loud may pause within a sentence: with half as many a real human as loud as the robot lost 2 dB."""
 USUAL = 1e-2
 """Initial peak of a voice, mean square, -20 dB: so that a soft onset does not lower the threshold."""
 LEARNING = 0.1
@@ -222,6 +222,8 @@ class FirstSounds:
         if not waits:
             self._since, self._before = 0, RECENT if loud else max(self._before - self._hop, 0)
             return False
-        if self._since or (loud and not self._before):  # who was as loud before the utterance began is another
+        if self._since or (
+            loud and not self._before
+        ):  # a sound that was as loud before the utterance began is somebody else's
             self._since += self._hop
         return 0 < self._since <= (LONGEST if self._heard else np.inf)

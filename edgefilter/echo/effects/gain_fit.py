@@ -133,7 +133,10 @@ class GainFit:
         return self._target - rows @ weights
 
     def _filtered(self, unknowns: Array) -> tuple[Sequence[Samples], Samples, Samples]:
-        """Sounds, their rows and their filters with these unknowns; kept, since the solver asks for slopes where it has asked for the residual."""
+        """Sounds of the law with these unknowns, their delayed copies (rows) and the best filters of TAPS taps.
+
+        The latest are kept, since the solver asks for slopes where it has just asked for the residual.
+        """
         if self._latest is None or not np.array_equal(self._latest[0], unknowns):
             sounds = self._make(self.x, unknowns)
             rows = self._rows(sounds)
