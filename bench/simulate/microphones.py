@@ -107,7 +107,7 @@ def _power(x: Array) -> Array:
 
 
 def _smooth(values: Array, seconds: float, before: Array) -> tuple[Array, Array]:
-    """Values (rows, frames), smoothed over `seconds` and begun from the last smoothed value `before`, (rows, 1), or (0,) at first.
+    """Smooth values (rows, frames) over `seconds`, from the last smoothed value `before`, (rows, 1), on, or from the first if that is (0,).
 
     Returns the last smoothed value and all of them.
     """
