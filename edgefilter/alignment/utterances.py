@@ -222,8 +222,7 @@ class FirstSounds:
         if not waits:
             self._since, self._before = 0, RECENT if loud else max(self._before - self._hop, 0)
             return False
-        if self._since or (
-            loud and not self._before
-        ):  # a sound that was as loud before the utterance began is somebody else's
+        # a sound that was as loud before the utterance began is somebody else's
+        if self._since or (loud and not self._before):
             self._since += self._hop
         return 0 < self._since <= (LONGEST if self._heard else np.inf)

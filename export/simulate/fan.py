@@ -74,9 +74,7 @@ def motors(rng: np.random.Generator, material: Material, played: Samples, rms: f
     delay = int(rng.integers(width))
     loud = loud[delay : delay + played.size]
     moving = np.clip(loud / max(float(np.quantile(loud, 0.9)), 1e-9), 0.0, 1.0) ** rng.uniform(0.3, 1.5)
-    sound = moving * sound
-    if rng.random() < WHINE:
-        sound = gears(rng, loud > 0.1 * loud.max())
+    sound = gears(rng, loud > 0.1 * loud.max()) if rng.random() < WHINE else moving * sound
     return (rms / max(active_rms(sound), 1e-9) * sound).astype(np.float32)
 
 

@@ -256,35 +256,34 @@ def test_interruptions_and_false_stops_from_end_to_end(
     assert not asked and again["tables"] == found["tables"]
 
 
+class Asking:
+    """A filter that passes the microphone, asks from its tenth hop on, for ten hops, and adds what it hears, (mic, ref), to `heard`."""
+
+    hop, speech_probability = 256, 0.0
+
+    def __init__(self, heard: list[tuple[np.ndarray, np.ndarray]]) -> None:
+        self.heard = heard
+
+    @property
+    def voice_gain(self) -> float:
+        return 0.25 if 10 <= len(self.heard) < 20 else 1.0
+
+    def process(self, mic: np.ndarray, ref: np.ndarray) -> np.ndarray:
+        self.heard.append((mic, ref))
+        return mic
+
+    def events(self) -> list[Event]:
+        return []
+
+    def flush(self) -> np.ndarray:
+        return np.zeros(0, np.float32)
+
+
 def test_a_robot_that_asks_is_heard_lower_as_late_as_its_sound_comes(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     heard = []
-
-    class Asking:
-        """Asks from its tenth hop on, for ten hops."""
-
-        hop, speech_probability = 256, 0.0
-
-        def __init__(self, *of: object, **more: object) -> None:
-            self.hops = 0
-
-        @property
-        def voice_gain(self) -> float:
-            return 0.25 if 10 <= self.hops < 20 else 1.0
-
-        def process(self, mic: np.ndarray, ref: np.ndarray) -> np.ndarray:
-            self.hops += 1
-            heard.append((mic, ref))
-            return mic
-
-        def events(self) -> list[Event]:
-            return []
-
-        def flush(self) -> np.ndarray:
-            return np.zeros(0, np.float32)
-
-    monkeypatch.setattr(closed_loop, "EgoFilter", Asking)
+    monkeypatch.setattr(closed_loop, "EgoFilter", lambda *of, **more: Asking(heard))
     ones, late = np.ones(50 * 256, np.float32), 5 * 256
     closed_loop.listen(1.5 * ones, ones, None, "crnn", closed_loop.Robot(ones, late, 12.0, tmp_path / "it.wav"))
     mic, ref = (np.concatenate(part) for part in zip(*heard))
@@ -297,31 +296,13 @@ def test_a_robot_that_asks_is_heard_lower_as_late_as_its_sound_comes(
 
 def test_a_robot_that_asks_behind_a_device_is_heard_through_it(monkeypatch: pytest.MonkeyPatch) -> None:
     heard = []
-
-    class Filter:
-        hop, speech_probability, voice_gain = 256, 0.0, 1.0
-
-        def __init__(self, *of: object, **more: object) -> None: ...
-
-        def process(self, mic: np.ndarray, ref: np.ndarray) -> np.ndarray:
-            heard.append(mic.copy())
-            return mic
-
-        def events(self) -> list[Event]:
-            return []
-
-        def flush(self) -> np.ndarray:
-            return np.zeros(0, np.float32)
-
-    monkeypatch.setattr(closed_loop, "EgoFilter", Filter)
+    monkeypatch.setattr(closed_loop, "EgoFilter", lambda *of, **more: Asking(heard))
     mic, device = babble(2.0, 3).astype(np.float32), microphones.Processing(10.0, 0.5, -30.0)
     robot = closed_loop.Robot(np.zeros_like(mic), 0, 0.0, device=device)
     out = closed_loop.listen(mic, mic, None, "crnn", robot)
-    expected = device.whole(mic)[0][: -microphones.LATE]
-    np.testing.assert_allclose(np.concatenate(heard)[microphones.LATE :], expected, atol=1e-6)
-    assert np.array_equal(out.samples, np.concatenate(heard)) and not np.allclose(
-        expected, mic[: expected.size], atol=1e-3
-    )
+    expected, through = device.whole(mic)[0][: -microphones.LATE], np.concatenate([one for one, _ in heard])
+    np.testing.assert_allclose(through[microphones.LATE :], expected, atol=1e-6)
+    assert np.array_equal(out.samples, through) and not np.allclose(expected, mic[: expected.size], atol=1e-3)
 
 
 @pytest.mark.slow
