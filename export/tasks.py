@@ -17,6 +17,7 @@ from edgefilter.engines.paper_ss import PAPER_STFT
 from edgefilter.errors import UsageError
 from export.losses import LossWeights, power_law_loss, si_sdr, sound_loss, speech_loss
 from export.network import EdgeConfig, EdgeCrnn, count
+from export.onnx_export import load
 from export.paper_network import DILATIONS, PaperConfig, PaperCrnn, parameter_count
 from export.recogniser_loss import RecogniserLoss
 
@@ -55,7 +56,8 @@ class EdgeTask:
     """The causal network on the linear stage's error; half: bfloat16 in the forward pass.
 
     before: configuration of the training that goes on, for what the options leave open. Raises UsageError for an option
-    of another network.
+    of another network. With --like the sounds of a trained network are the target of both, so that only the speech head learns anything
+    new, with all of the network ("learning without forgetting", Li & Hoiem 2016).
     """
 
     kind: ClassVar[str] = "edge"
@@ -76,6 +78,7 @@ class EdgeTask:
                 raise UsageError(f"{name} is {share:g}, expected 0 to 1")
         self.fans_kept = options.fan_kept, options.fan_recognised
         self.recogniser_weight, self.second_alone = options.recogniser_weight, options.second_alone
+        self.like = load(options.like).network.eval().requires_grad_(False) if options.like else None
 
     def network(self) -> EdgeCrnn:
         network = EdgeCrnn(self._config).to(memory_format=torch.channels_last)
@@ -102,9 +105,13 @@ class EdgeTask:
         scale = batch["scale"][:, None, None, None]
         clean, fan = scale * batch["clean"], scale * batch["fan"]
         listen, recognise = (scale * sound.float() for sound in sounds)
+        pairs = [(clean, clean + kept * fan) for kept in self.fans_kept]
+        if self.like:
+            with torch.no_grad():
+                *before, _, _ = self.like(*inputs, self.like.initial_state(inputs[0].shape[0]))
+            pairs = [(scale * sound, scale * sound) for sound in before]
         terms, second = (
-            sound_loss(sound, clean, clean + kept * fan, self.weights)
-            for sound, kept in zip((listen, recognise), self.fans_kept, strict=True)
+            sound_loss(sound, *pair, self.weights) for sound, pair in zip((listen, recognise), pairs, strict=True)
         )
         terms["speech"] = speech_loss(logit.float(), batch["active"], batch["heed"])
         terms["recognise"] = second["total"]

@@ -114,6 +114,8 @@ def arguments(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--second-alone", action="store_true", help="train the head of the sound for a recogniser, and nothing else"
     )
+    told = "train the speech head by all layers, and keep both sounds as this network makes them"
+    parser.add_argument("--like", type=Path, metavar="CHECKPOINT", help=told)
     parser.add_argument("--suppression", type=float, default=LossWeights.suppression)
     parser.add_argument("--si-sdr", type=float, default=LossWeights.si_sdr)
     parser.add_argument("--start", type=Path, metavar="CHECKPOINT", help="weights to begin with")

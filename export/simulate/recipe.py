@@ -123,6 +123,8 @@ FIELD = replace(DEVICES, motors=0.2, hum=0.1, soft=0.3, knocks=0.3, distortion_d
 recordings of speech are trimmed at 34 dB below their peak, and so begin abruptly; and with short sounds as loud as a human,
 since in other recipes every sound as loud is a human. References never stop: a network that was trained with some that did
 took a loud human beside a silent reference for the robot (gf_655836 in real2)."""
+GESTURES = replace(FIELD, motors=0.6)
+"""FIELD with more robots that move: gears that whine are the sound that a network which had not heard them took for a human most."""
 RECIPES = {
     "edge": BENCHMARK,
     "paper": PAPER,
@@ -131,4 +133,5 @@ RECIPES = {
     "voices": VOICES,
     "devices": DEVICES,
     "field": FIELD,
+    "gestures": GESTURES,
 }

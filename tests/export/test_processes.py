@@ -29,6 +29,7 @@ OPTIONS = argparse.Namespace(
     fan_kept=0.0,
     fan_recognised=1.0,
     second_alone=False,
+    like=None,
     full_precision=True,
 )
 WORDS = "--hop 32 --channels 4 4 4 4 --hidden 8 --full-precision --steps 3 --every 3 --batch 2 --seconds 0.5".split()

@@ -235,8 +235,9 @@ def test_where_the_reference_was_found_only_about_it_is_told_early_or_late(parts
     assert np.array_equal(there["mic"], displaced["mic"])
 
 
-def test_the_field_alone_has_soft_humans_and_knocks():
-    assert {name for name, recipe in RECIPES.items() if recipe.soft or recipe.knocks} == {"field"}
+def test_the_field_and_its_gestures_alone_have_soft_humans_and_knocks():
+    assert {name for name, recipe in RECIPES.items() if recipe.soft or recipe.knocks} == {"field", "gestures"}
+    assert RECIPES["gestures"] == replace(RECIPES["field"], motors=0.6)
 
 
 def test_a_soft_human_rises_from_nothing_within_300_ms_and_is_the_same_behind(parts):

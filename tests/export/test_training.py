@@ -14,7 +14,7 @@ from edgefilter.dsp.stft import StftConfig
 from edgefilter.engines.spectral_subtraction import SpectralSubtraction
 from edgefilter.errors import UsageError
 from edgefilter.types import Frame
-from export import checkpoint, dataset, train
+from export import checkpoint, dataset, onnx_export, train
 from export.crops import Batches, Shape, heed
 from export.items import Items, mapped
 from export.losses import LossWeights, power_law_loss, si_sdr, sound_loss, speech_loss
@@ -366,6 +366,26 @@ def begun(tmp_path_factory):
     folder = tmp_path_factory.mktemp("begun")
     assert smoked(folder, "tiny", *TINY) == smoked(folder, "narrow", *NARROW) == 0
     return folder
+
+
+@pytest.mark.slow
+def test_a_network_that_learns_speech_like_another_keeps_its_sounds(begun, tmp_path):
+    """Its own sounds cost nothing, others do; all layers learn speech, and the network that is the example learns nothing."""
+    known = begun / "tiny" / "best.pt"
+    folders = ["--data", str(tmp_path / "d"), "--validation", str(tmp_path / "v"), "--output", "r"]
+    given = train.arguments([*folders, "--si-sdr", "0", "--like", str(known), *TINY])
+    train.smoke(given)
+    task, batch = EdgeTask(given), Batches(Items(given.data), SMALL.stft, Shape(2, 0.5), seed=1).draw(0)
+    same = onnx_export.load(known).network.requires_grad_(True)
+    terms, _ = task.loss(same, batch)
+    assert float(terms["total"]) == pytest.approx(task.weights.speech * float(terms["speech"]), abs=1e-6)
+    terms["total"].backward()
+    assert float(same.mic_1.convolution.weight.grad.abs().sum()) > 0.0
+    assert not any(weight.requires_grad for weight in task.like.parameters())
+    with torch.no_grad():
+        same.mask.bias += 1.0
+    others, _ = task.loss(same, batch)
+    assert float(others["complex"]) > 1e-4 and float(others["recognise"]) > 1e-4
 
 
 @pytest.mark.slow
