@@ -28,7 +28,7 @@ HEADLINE = ("unfiltered", "speexdsp-suppressed", "linear-uncalibrated", "linear-
             "crnn-uncalibrated-learning", "crnn", "crnn-learning")  # fmt: skip
 """Rows of the table that docs/index.md quotes."""
 PAIRED = "crnn-uncalibrated-learning"
-"""The row with which the others of that table are compared, on the same clips: it needs nothing and is in all of them."""
+"""The baseline of that table: each other row is compared with it on the same clips. It needs no calibration, so every clip has it."""
 CUT = ("unfiltered", "paper-ss", "linear", "ss", "crnn", "crnn-learning", "crnn-uncalibrated", "speexdsp-suppressed",
        "aec3")  # fmt: skip
 """Rows that the slices show, where they ran."""
@@ -132,7 +132,7 @@ def _real(folder: Path, options: argparse.Namespace) -> Iterator[Clip]:
 
 
 def metric(rows: Sequence[dict]) -> tuple[str, int, str, int]:
-    """By what rows are compared: key, digits, heading, and 1 where more is worse; words where there is a recogniser."""
+    """The figure by which rows are compared: key, digits, heading, 1 where higher is worse, else -1; word errors, or SI-SDR without a recogniser."""
     words = any(row.get("capped") is not None for row in rows)
     return ("capped", 0, "WER, %", 1) if words else ("si_sdr", 1, "SI-SDR, dB", -1)
 

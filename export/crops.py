@@ -27,8 +27,8 @@ COLOURED, COLOUR_DB, WAVES = 0.5, 4.0, 4
 """Share of crops in which microphone, human and reference each get another frequency response, and of how many waves along
 the ear's scale, each up to so deep, that is: other devices and voices than the ones that were simulated."""
 LOUD_REST = 0.1
-"""Part of the error's power that the human is taken to have at least when crops are brought to one level: beside a crop
-that holds only the end of a word and a loud robot, no other would count in the loss."""
+"""Least human power assumed when a crop is scaled to one level for the human, as a part of the linear stage's error: a crop with the end of a
+word beside a loud robot would else be scaled up until the loss saw nothing but it."""
 ONSET, ONSET_S, QUIET_S = 4.0, 0.3, 0.5
 """How much more the speech head answers for the first seconds of a human than for the rest, and after how many without one."""
 NOTHING = 1e-9

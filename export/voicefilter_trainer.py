@@ -58,7 +58,7 @@ class VoiceFilterTrainer(Trainer):
 
 @torch.no_grad()
 def validate(task: VoiceFilterTask, network: nn.Module, held_out: Mixtures) -> dict[str, float]:
-    """Mean loss over the items whose human is told, and mean SI-SDR in dB: of the estimate, the same told another human, the microphone.
+    """Mean loss, and mean SI-SDR in dB with the right d-vector, with that of another human and of the microphone, over items with a d-vector.
 
     An SI-SDR counts as 30 dB at most and -30 dB at least.
     """

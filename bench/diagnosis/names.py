@@ -33,7 +33,7 @@ from edgefilter.types import Samples
 SIGNALS = (*CALIBRATION, "ref", "mic")
 STRENGTHS = ("clear", "moderate", "near")
 EXPLAINED_LIMIT_DB = 1.0
-"""Excess above which a case from outside the catalogue must never be called explained."""
+"""Left error over the noise floor, dB, above which a case whose effect is not in the catalogue must never be called explained."""
 
 
 @dataclass(frozen=True)

@@ -91,7 +91,7 @@ def _same(x: Array) -> Array:
 
 
 def _hidden(name: str) -> Change:
-    """An effect of hidden_effects, and what the player makes of any other sound with it."""
+    """What draws one of `hidden_effects` for a robot, and a player with the same effect for the test sounds that the diagnosis asks for."""
 
     def change(rng: Rng, scene: Scene, strength: str) -> tuple[Chain, Player]:
         chain, parameters, _ = hide(rng, scene, scene.usual, name, strength)

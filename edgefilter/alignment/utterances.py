@@ -79,8 +79,8 @@ class Sustained:
 class OnsetDetector:
     """Cuts the reference into utterances, hop by hop.
 
-    current: the last one that began; before the first, one that ended long ago. peak, least: mean square of the loudest and of the
-    softest hop of the last seconds, the latter without digital silence, in which devices begin.
+    current: the latest utterance; before the first, one with times long past stands for it. peak, least: mean square of the loudest and
+    of the softest hop, which are forgotten within some ten seconds; least skips hops of zeros, which devices deliver when they start.
     """
 
     def __init__(self, hop: int) -> None:

@@ -160,7 +160,7 @@ class LiveSource(Source):
 def _opener(
     device: Named | SpokenReference, channels: Channels | None = None
 ) -> Callable[[], InputPort | SpokenReference]:
-    """What makes an input of a device, each time anew; what is spoken goes on where it was."""
+    """A function that opens a device as an input, also again after it was lost; a `SpokenReference` is not opened: the same one is returned."""
     if isinstance(device, SpokenReference):
         return lambda: device
     return partial(input_port, find(device, "input"), channels=channels)

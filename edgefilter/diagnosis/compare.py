@@ -119,7 +119,7 @@ def describe(prepared: Straightened, model: EchoModel, score: Score | None = Non
 
 
 def independence_of(prepared: Straightened, model: EchoModel, score: Score) -> Independence | None:
-    """Whether what a model leaves is noise, see `independence`; score: of that model."""
+    """Whether a model's residual tells nothing of the reference any more: `independence`, or None like it. score: of that model."""
     prepared = prepared.behind(model)
     measurement, use, active = prepared.measurement, prepared.usable, prepared.active
     flat = (measurement.recording - score.prediction) / model.microphone_gain(measurement.recording.size)
@@ -128,7 +128,7 @@ def independence_of(prepared: Straightened, model: EchoModel, score: Score) -> I
 
 
 def _as_played(reference: Samples, model: EchoModel) -> Samples:
-    """The reference (n,) as a model sends it into the path, its clock that of the recording."""
+    """The reference (n,) with the model's effects before the loudspeaker and its clock drift: what the loudspeaker is given."""
     for effect, values in chain(model.effects):
         if effect.stage in ("source", "time"):
             reference = effect.apply(reference, values, SAMPLE_RATE)

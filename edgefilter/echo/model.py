@@ -54,7 +54,11 @@ class EchoModel:
 
     @cached_property
     def _chain(self) -> tuple[Chain, list[tuple[Samples, tuple[Effect, Values] | None]], int, Chain]:
-        """Effects ahead; the path and each later change of it, (taps,) with the filters right behind; their lead; effects behind."""
+        """The model as a sequence: effects before the path; impulse responses (taps,); index of time zero in each; effects after the path.
+
+        The first response is the path, each other what an event adds to it, with its effect. Linear effects that follow the path directly are
+        convolved into all of them.
+        """
         ahead, on_it, behind = self._by_stage
         path = self.response()
         later = [pair for pair in on_it if pair[0].event]

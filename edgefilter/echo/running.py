@@ -127,15 +127,15 @@ def stream_form(effect: Effect, values: Values) -> Callable[[], Runner] | None:
 
 
 def reach(effect: Effect, values: Values) -> str:
-    """A sentence on what the running filter makes of the effect, where that is not what apply does; else empty."""
+    """A sentence on how the running filter treats the effect, where that differs from apply; else empty."""
     if effect.run_note or vanishes(effect, values):
         return effect.run_note
     if effect.stage == "noise" or effect.adds_noise or is_filter(effect, values) or stream_form(effect, values):
         return ""
     if effect.timed:
-        return "the running filter makes nothing of it: it is of this recording's moments"
+        return "the running filter ignores it: it happened at certain moments of this recording"
     return (
-        f"the running filter makes nothing of it: it needs more than {MEMORIES[-1]} samples of the past, or depends on"
+        f"the running filter ignores it: it needs more than {MEMORIES[-1]} samples of the past, or depends on"
         " when the recording began; a method run() would tell how it goes on from hop to hop"
     )
 

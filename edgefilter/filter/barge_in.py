@@ -85,8 +85,8 @@ class BargeInSettings:
     def at_rate(cls, false_starts_per_hour: float, **others: Any) -> BargeInSettings:
         """Settings with the threshold for so many false starts in an hour in which the robot talks alone; others: as of the class.
 
-        It is about right for the mean of robots, of which most have fewer. The fewer, the more humans are missed.
-        Raises UsageError for a rate that is not above 0 and below that of even odds, 90 an hour.
+        The mean of many robots has about this rate; most robots have fewer, since a few have many. The lower the rate, the more humans
+        are missed. Raises UsageError for a rate that is not above 0 and below 90, that of a threshold of 0.5.
 
         >>> round(BargeInSettings.at_rate(9.0).threshold, 3)
         0.99

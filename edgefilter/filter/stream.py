@@ -126,7 +126,7 @@ class Stream:
         return self._deliver(self._run(mic, ref))
 
     def robot_removed(self) -> Samples:
-        """What the linear stage left of each microphone since the last call, 30 s at most, (n, microphones)."""
+        """Each microphone with the linear stage's echo subtracted, since the last call, 30 s at most, (n, microphones)."""
         removed = list(self._removed)
         self._removed.clear()
         return np.concatenate(removed) if removed else np.zeros((0, self._microphones or 1), np.float32)

@@ -359,7 +359,7 @@ class _Speaker(_Client):
 
 
 class _Recogniser(_Client):
-    """A client that has sound recognised: the recogniser behind gets the human's finished turn in its place."""
+    """A client that asks for speech to text: instead of the sound that it sends, the recogniser gets the human's finished turn, filtered."""
 
     def __init__(self, service: EgoService, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         super().__init__(service, reader, writer)

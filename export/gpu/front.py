@@ -31,7 +31,7 @@ TINY = float(fourier.TINY)
 
 
 class Cancelled(NamedTuple):
-    """echo (batch, n), uncertainty (batch, n / hop, hop + 1): as CancellerOutput has them, hop after hop."""
+    """`CancellerOutput` of all hops of a batch: echo (batch, n), uncertainty (batch, hops, hop + 1)."""
 
     echo: Tensor
     uncertainty: Tensor

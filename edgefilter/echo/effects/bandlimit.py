@@ -35,7 +35,7 @@ LEAST_ORDER, BY_LAW = 2.0, 0.77
 """Orders of band limits are 2.3 or more, those of treble shelves that look like one 1.0 to 1.6; and the low-pass without its taps
 does .81 to .99 of what both do, of .73 at most where another equaliser looks like one (10 band limits, 8 equalisers)."""
 PASSED_HZ, FLAT_DB = 300.0, 0.3
-"""From where on a band limit passes the voice, and the standard deviation of a gain over frequency that is one gain."""
+"""From so many Hz to well below the cut-off the gain may have this standard deviation, dB, to be taken as one gain without taps."""
 LOUD, NOT_CUT = 3.0, 0.05
 """Cells count above a cut-off where the voice was due by this factor over the fan, and this part of it
 is still there in the median one: 0.00 behind 15 band limits, rattles beside them or not, 0.1 to 0.4 behind 8 codecs."""
