@@ -97,7 +97,7 @@ def row(name: str) -> Row:
 
 
 def catalogue(networks: Mapping[str, Path] | None = None) -> dict[str, System]:
-    """All rows by name, in the order of the tables. networks: further networks for the engine crnn, by name."""
+    """All systems that the benchmark compares, by name, in the order of its tables. networks: ONNX files, each a further system with engine crnn."""
     rows = [System("unfiltered", "Unfiltered", "unfiltered", lambda clip: Output(clip.mic), latency_ms=0.0)]
     rows += [
         *_paper(),

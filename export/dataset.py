@@ -40,7 +40,7 @@ ROOMS = {"lab": 1 / 3, "office": 1 / 2, "hall": 1 / 6}
 
 
 def pack(conversation: Conversation, stft: StftConfig, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """The item's arrays: int16 at a scale at which the loudest sample is full. rng: for the linear stage's errors."""
+    """The item's arrays as int16, the reference at its own scale, all else at one. rng: draws how wrong the simulated linear stage is."""
     front = front_end(conversation.stage, conversation.profile, stft, rng, learns=conversation.before > 0)
     signals = conversation.mic, conversation.reference, conversation.clean, conversation.fan
     heard = listen(front, *signals, stft, conversation.before)

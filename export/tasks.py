@@ -98,7 +98,9 @@ class EdgeTask:
 
     def loss(self, network: nn.Module, batch: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:
         if "residual" not in batch:
-            raise UsageError(f"the data was simulated for another transform, expected --hop {self.stft.hop}")
+            raise UsageError(
+                f"the data was simulated with another --hop than {self.stft.hop}: give that one, or simulate it anew"
+            )
         inputs = [batch[name] for name in INPUTS]
         with torch.autocast(inputs[0].device.type, torch.bfloat16, enabled=self.half and network.training):
             *sounds, logit, _ = network(*inputs, network.initial_state(inputs[0].shape[0]))

@@ -243,7 +243,7 @@ def kokoro(model: Path, voices: Path) -> Renderer:
 
 
 def renderings(folder: Path) -> Renderer:
-    """Takes FOLDER/VOICE/NNN.flac, .wav or .ogg, or FOLDER/SET/VOICE/...; raises UsageError for one that is missing."""
+    """What reads FOLDER/VOICE/NNN.flac, .wav or .ogg, or FOLDER/SET/VOICE/..., for a sentence; it raises UsageError where that file is missing."""
 
     def read(sentence: Sentence) -> tuple[np.ndarray, int]:
         roots = (folder, folder / sentence.folder)

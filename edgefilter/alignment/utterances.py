@@ -208,9 +208,10 @@ class FirstSounds:
         self._gain, self._heard, self._since, self._before = self._calibrated, False, 0, 0
 
     def step(self, mic: Samples, explained: Samples, loudest: float, state: AlignmentState, waits: bool) -> bool:
-        """Take a hop of the microphone and of the reference at the present delay, zeros where there is none, (hop,) each.
+        """Take a hop; whether its sound is the robot at another delay.
 
-        loudest: mean square of the reference's loudest hop. waits: whether there is an utterance that was not found yet.
+        mic: (hop,). explained: (hop,), the reference at the present delay, zeros while no delay is known. loudest: mean square of the
+        reference's loudest hop. waits: whether there is an utterance whose delay was not found yet.
         """
         power, brought = float(np.dot(mic, mic)), float(np.dot(explained, explained))
         if state == "locked" and brought > 0.1 * self._hop * loudest:

@@ -42,7 +42,7 @@ def _of_portaudio() -> list[Device]:
 
 
 def _devices() -> list[Device]:
-    """PortAudio's, and the sound server's inputs and outputs, each behind the one that leads to the server."""
+    """PortAudio's devices, then the sound server's inputs and outputs: copies of the PortAudio device through which the server is opened."""
     found = _of_portaudio()
     served = []
     for kind in ("input", "output"):

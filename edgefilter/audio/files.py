@@ -374,7 +374,7 @@ class FileSink(Sink):
 
 
 def write_file(path: str | Path, samples: Samples, float32: bool = False) -> None:
-    """Write samples (n,), or as 32-bit float (n, channels), to a file of their own; raises as FileSink does."""
+    """Write a whole file of samples, (n,) or (n, channels); float32: as 32-bit float. Raises as FileSink does."""
     with FileSink(path, float32, 1 if samples.ndim == 1 else samples.shape[1]) as sink:
         sink.write(samples)
 

@@ -124,7 +124,7 @@ class Pairing:
         self._ref, self._at = self._ref[self._at :], 0
 
     def move(self, by: int) -> Samples:
-        """Go on by so many samples of the reference, (n,), once all of them have come; back, by silence that stands in for them."""
+        """Skip so many samples of the reference and return them, (n,), once all of them have come, till then (0,); by < 0: insert so much silence."""
         self._debt += by
         late = self._take(self._debt if 0 < self._debt <= self.queued else 0)
         self._debt -= late.size

@@ -273,8 +273,8 @@ def _approximation(played: Spectra, part: Samples) -> LinearApproximation:
     added = (2 * odd + noise / (PERIODS - 1)) * _smooth(counted) / REALISATIONS
     linear = _density(power(best) * energy, every) - added
     level = decibels(np.array([total_power(psd) for psd in total]))
-    # standard deviation of a distortion's power where there is noise alone: of the sum over every other line of |line|^2
-    # less its expectation, each the mean over all realisations
+    # standard deviation that noise alone gives the power of a distortion: |line|^2, averaged over all realisations, less what is
+    # expected of the noise, summed over every second line
     chance = np.sqrt(np.sum(noise**2, axis=1) * GRID_HZ[1] * LINE_HZ / 2 / REALISATIONS) / (PERIODS - 1)
     least = decibels(OVER_CHANCE * chance / np.array([max(total_power(psd), 1e-30) for psd in linear]), 1e-10)
     densities = {"played": total, "linear": linear, "noise": noise, "even": even, "odd": odd}

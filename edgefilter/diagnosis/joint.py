@@ -80,7 +80,7 @@ def _followed(wanted: Sequence[str]) -> list[str]:
 
 
 def _without(model: EchoModel, followed: Sequence[str]) -> EchoModel:
-    """The model without the followed effects, also those that the profile holds: this recording may have others."""
+    """The model without the effects of these names, also where the profile holds them: in this recording they may have other values."""
     return replace(model, effects=tuple(entry for entry in model.effects if entry[0] not in followed))
 
 

@@ -49,10 +49,10 @@ class Ordinary:
     independent: float = 1.0
 
     def p_value(self, name: str, gain_db: float) -> float:
-        """Share of ordinary recordings in which any effect is as surprising as that one, which lowers the level by gain_db.
+        """Share of recordings with no missing effect in which the fit of any effect surprises as much as this one, which lowers the error by gain_db.
 
-        Of independent effects (Sidak 1967), each of whose p-values is uniform up to the share of recordings in which its
-        fit helps at all; as they are not independent, they count as fewer.
+        By Sidak's rule (1967) for independent effects: the p-value of each is uniform from 0 to the share of recordings in which
+        its fit helps at all. Since they are not independent, fewer effects are counted than there are.
         """
         own = self.of(name, gain_db)
         others = prod(1.0 - min(own, chance.share) for chance in self.effects.values())

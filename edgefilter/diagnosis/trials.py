@@ -294,7 +294,7 @@ class Workbench:
         return min(enough, key=lambda trial: (find(trial.name).complexity, -trial.gain_db), default=None)
 
     def _outdoes(self, one: Trial, other: Trial) -> bool:
-        """Whether one explains more than another, by more than chance; a flexible one by more than it takes up of whatever is left."""
+        """Whether one explains more than another, not by chance alone; if flexible, by more than such an effect fits of any residual."""
         by_chance = own_p_value(one.name, one.gain_db - other.gain_db) > self.criteria.false_rate
         taken_up = find(one.name).flexible and other.gain_db >= self.criteria.nearly * one.gain_db
         return not (by_chance or taken_up)

@@ -159,7 +159,7 @@ class EchoModel:
 
     @property
     def timed(self) -> bool:
-        """Whether what the model predicts depends on when the recording began."""
+        """Whether an effect counts its times from the beginning of the recording, as a jump does."""
         return any(find(name).timed for name, _ in self.effects)
 
     def with_effect(self, name: str, values: Values) -> EchoModel:

@@ -49,7 +49,7 @@ class Material:
 
 
 def read_noises(*folders: Path) -> tuple[Samples, ...]:
-    """All recordings below these folders; raises UsageError where there are none."""
+    """All recordings in these folders and those below; raises UsageError where all of them together hold none."""
     return tuple(_read(path) for folder in folders for path in _sounds(folder, "noise"))
 
 

@@ -48,7 +48,7 @@ SMOOTH = 32
 SURE = 4.0
 """And what is missing is so many standard deviations: by chance at one edge in thirty thousand."""
 PASSED = (0.8, 1.2)
-"""Between these times the predicted power is what lies well below the edge: the band is cut, not the volume turned."""
+"""Ratio of heard to predicted power well below the edge, between which the band was cut; beyond, the volume was changed."""
 
 
 class Bandlimit(Effect):
@@ -116,7 +116,7 @@ class Bandlimit(Effect):
             best, late = best_of(near, np.stack([low_pass(found.hz, *values) for values in near]))
             step = 1.0 + (step - 1.0) * 0.6
         like_one = best[0] < HIGHEST_HZ and best[1] >= LEAST_ORDER
-        noisy = bool(model.unpredictable(measurement.reference))  # then what is heard there may be that
+        noisy = bool(model.unpredictable(measurement.reference))  # what is heard above an edge may be that noise
         edge = None if noisy else band_edge(found)
         if not like_one and edge is None:
             return neutral(self)
