@@ -6,6 +6,7 @@ import argparse
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, Protocol
 
@@ -22,7 +23,7 @@ from export.paper_network import DILATIONS, PaperConfig, PaperCrnn, parameter_co
 from export.recogniser_loss import RecogniserLoss
 
 INPUTS = ("error", "mic", "reference", "echo", "noise", "residual")
-FOREIGN = {"edge": ("filters", "lstm"), "paper": ("channels", "erb", "recogniser")}
+FOREIGN = {"edge": ("filters", "lstm"), "paper": ("channels", "erb", "recogniser", "like")}
 """Options of the other network, by kind; None where they were not given."""
 
 FIRST_MASK = 10 ** (-25 / 20)
@@ -78,7 +79,14 @@ class EdgeTask:
                 raise UsageError(f"{name} is {share:g}, expected 0 to 1")
         self.fans_kept = options.fan_kept, options.fan_recognised
         self.recogniser_weight, self.second_alone = options.recogniser_weight, options.second_alone
-        self.like = load(options.like).network.eval().requires_grad_(False) if options.like else None
+        self.like = self._example(options.like) if options.like else None
+
+    def _example(self, checkpoint: Path) -> EdgeCrnn:
+        """The trained network of --like, which learns nothing. Raises UsageError where it takes no such spectra, ModelError where there is none."""
+        network = load(checkpoint).network
+        if not (isinstance(network, EdgeCrnn) and network.config.stft == self.stft):
+            raise UsageError(f"--like {checkpoint} holds a network of another --network or --hop than this training's")
+        return network.eval().requires_grad_(False)
 
     def network(self) -> EdgeCrnn:
         network = EdgeCrnn(self._config).to(memory_format=torch.channels_last)
@@ -105,15 +113,11 @@ class EdgeTask:
         with torch.autocast(inputs[0].device.type, torch.bfloat16, enabled=self.half and network.training):
             *sounds, logit, _ = network(*inputs, network.initial_state(inputs[0].shape[0]))
         scale = batch["scale"][:, None, None, None]
-        clean, fan = scale * batch["clean"], scale * batch["fan"]
+        clean = scale * batch["clean"]
         listen, recognise = (scale * sound.float() for sound in sounds)
-        pairs = [(clean, clean + kept * fan) for kept in self.fans_kept]
-        if self.like:
-            with torch.no_grad():
-                *before, _, _ = self.like(*inputs, self.like.initial_state(inputs[0].shape[0]))
-            pairs = [(scale * sound, scale * sound) for sound in before]
         terms, second = (
-            sound_loss(sound, *pair, self.weights) for sound, pair in zip((listen, recognise), pairs, strict=True)
+            sound_loss(sound, *targets, self.weights)
+            for sound, targets in zip((listen, recognise), self._targets(batch, scale, clean), strict=True)
         )
         terms["speech"] = speech_loss(logit.float(), batch["active"], batch["heed"])
         terms["recognise"] = second["total"]
@@ -122,6 +126,15 @@ class EdgeTask:
             terms["recogniser"] = self.recogniser(recognise, clean)
             terms["total"] = terms["total"] + self.recogniser_weight * terms["recogniser"]
         return terms, listen
+
+    def _targets(self, batch: Mapping[str, Tensor], scale: Tensor, clean: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Of each sound the true voice and what is wanted of it; of --like both are the sound as that network makes it."""
+        if self.like is None:
+            return [(clean, clean + kept * (scale * batch["fan"])) for kept in self.fans_kept]
+        inputs, like = [batch[name] for name in INPUTS], self.like.to(clean.device)
+        with torch.no_grad():
+            *sounds, _, _ = like(*inputs, like.initial_state(clean.shape[0]))
+        return [(scale * sound, scale * sound) for sound in sounds]
 
 
 class PaperTask:

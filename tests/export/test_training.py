@@ -378,7 +378,7 @@ def test_a_network_that_learns_speech_like_another_keeps_its_sounds(begun, tmp_p
     task, batch = EdgeTask(given), Batches(Items(given.data), SMALL.stft, Shape(2, 0.5), seed=1).draw(0)
     same = onnx_export.load(known).network.requires_grad_(True)
     terms, _ = task.loss(same, batch)
-    assert float(terms["total"]) == pytest.approx(task.weights.speech * float(terms["speech"]), abs=1e-6)
+    assert terms["total"].item() == pytest.approx(task.weights.speech * terms["speech"].item(), abs=1e-6)
     terms["total"].backward()
     assert float(same.mic_1.convolution.weight.grad.abs().sum()) > 0.0
     assert not any(weight.requires_grad for weight in task.like.parameters())
@@ -386,6 +386,15 @@ def test_a_network_that_learns_speech_like_another_keeps_its_sounds(begun, tmp_p
         same.mask.bias += 1.0
     others, _ = task.loss(same, batch)
     assert float(others["complex"]) > 1e-4 and float(others["recognise"]) > 1e-4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "hop"), [("narrow", "32"), ("tiny", "16")])
+def test_a_network_that_takes_other_spectra_is_no_example(begun, trained, capsys, name, hop):
+    known = str(begun / name / "best.pt")
+    assert trained("run", *TINY, "--hop", hop, "--like", known) == 1
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said == f"train: --like {known} holds a network of another --network or --hop than this training's"
 
 
 @pytest.mark.slow
@@ -505,6 +514,7 @@ def test_a_training_of_the_papers_network_goes_on_in_its_own_width(trained, tmp_
         ("--lstm 4", "--lstm is of --network paper"),
         ("--network paper --channels 4 4 4 4", "--channels is of --network edge, and this is --network paper"),
         ("--network paper --erb 16", "--erb is of --network edge"),
+        ("--network paper --like known.pt", "--like is of --network edge"),
         ("--network paper --norm layer", "--norm is layer, expected batch or none for --network paper"),
         ("--network paper --filters 4 4 4", "--filters has 3 numbers, expected one, or two"),
         ("--network paper --filters 4 0", "--filters has 0, expected 1 or more"),

@@ -21,7 +21,7 @@ STEP = 40
 LENGTHS = (4, 8, 12, 16, 24)
 """Steps of a frame: 10, 20, 30, 40, 60 ms, those of RTP's audio formats (RFC 3551, 6716)."""
 TAPS, SPREAD = 640, 600
-"""Samples of the path from the direct sound on in which a missing frame is looked for, and of the whitening filter on each side."""
+"""Samples of the path from the direct sound on by which a missing frame is recognised, and of the whitening filter on each side."""
 BLOCK = STEP * min(LENGTHS)
 """Samples of the shortest frame."""
 LOUD, MISSING, PREDICTED = 30.0, 0.5, 0.1

@@ -164,7 +164,7 @@ class Rattle(Effect):
 
 
 def _trains(x: Samples, values: Values, sample_rate: int) -> tuple[Samples, Samples]:
-    """Impulses, (n,) each, where the cone that x (n,) drives hits its stop on the way out, and where on the way in."""
+    """Impulses, (n,) each, of a loose part that x (n,) drives: where it knocks on its way out, and where on its way in."""
     moved = resonated(x, float(values["resonance_hz"]), float(values["q"]), sample_rate)
     return find_knocks(moved, float(values["threshold"]))
 
