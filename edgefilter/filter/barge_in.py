@@ -37,8 +37,9 @@ heard. 124 simulated robots alone (recipe `field`, 25 minutes, closed loop): no 
 without this bound, 60 without lowering. Without a calibration it would give back 3 of the 5 false starts that lowering
 prevents (75 robots), so these robots always wait."""
 QUESTIONS_S = 1.0
-"""Least seconds from one lowering of the voice to the next, since one that falls more often sounds broken: by definition. Nobody is
-suspected meanwhile: judged without a question, two of 21 real recordings of a robot alone would hold a false start, and none so."""
+"""Seconds from one lowering of the voice within which the robot does so again only for good reason, since a voice that falls more often sounds
+broken: by definition. Of 52 humans laid on 22 real recordings 38 are noticed within a second, 34 if nobody were suspected
+meanwhile, and the robot itself 8 times in 9.5 minutes either way."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +150,8 @@ class BargeIn:
     robot lowers its voice to ask who speaks, those bounds only tell whether anybody does, human or robot. It is a human where the sum reaches the
     bound of UNASKED, or where speech goes on once the lower voice is heard at the microphone: from that moment on the sum begins
     anew and never falls below 0 (Page 1954, "Continuous inspection schemes"); if it does not reach the upper bound within
-    the time to confirm, it was the robot. Within QUESTIONS_S of such a question nobody is suspected.
+    the time to confirm, it was the robot. Within QUESTIONS_S of such a question the sum begins at the lower bound,
+    the odds that the question left, and only where it reaches the upper one the robot asks again.
     hop_s: seconds between two probabilities. settings: None for the defaults. calibrated: whether the robot is. before: how often it
     was taken for a human during its calibration, for `own` to go on from.
 
@@ -177,7 +179,7 @@ class BargeIn:
 
     def _forget(self) -> None:
         self._hops, self._anew, self._asks = 0, 0, False
-        self._evidence, self._somebody, self._certain = 0.0, False, False
+        self._evidence, self._before, self._somebody, self._certain = 0.0, 0.0, False, False
         self._told: EventKind | None = None
 
     @property
@@ -226,27 +228,35 @@ class BargeIn:
         self._rest = max(0, self._rest - 1)
         if not self._hops:
             self._needed = self._threshold + self.own.higher
-            if log_odds(probability) < self._needed or self._rest:
+            if log_odds(probability) < self._needed:
                 return None
         if not self._hops or (self._certain and not self._told and not wait):  # suspected, or the wait is over
-            asked = heard_after if heard_after <= self._longest else 0
-            self._rest = self._between if asked else self._rest
-            self._asks, self._anew = asked > 0, self._hops + asked
-            self._evidence, self._certain = 0.0, False
+            self._evidence = self._before = -self._bound if self._rest else 0.0
+            self._anew, self._asks, self._certain = self._hops, False, False
+            if not self._rest:
+                self._ask(heard_after)
         self._hops += 1
         if self._silent >= self._pause or not self._holds(probability):
             return self.end()
+        if self._certain and self._rest and not (self.speaking or self._asks or self._evidence >= self._sure):
+            self._ask(heard_after)
         now: EventKind = "speech_started" if self._certain else "speech_suspected"
         if self._hops <= wait or self._told in (now, "speech_started"):
             return None
         self._told = now
         return now
 
+    def _ask(self, heard_after: int) -> None:
+        """Let the robot lower its voice, if it is soon heard lower: what is heard from then on decides."""
+        if 0 < heard_after <= self._longest:
+            self._rest, self._anew = self._between, self._hops + heard_after
+            self._asks, self._certain = True, False
+
     def _holds(self, probability: float) -> bool:
         """Whether what was suspected is not dismissed by another hop."""
         if self._certain:
             return True
-        if self._hops == self._anew + 1:
+        if self._hops == self._anew + 1 > 1:
             self._evidence = 0.0
         if self._hops > 1:  # the first was chosen for its odds
             self._evidence += log_odds(probability) - self._needed
@@ -259,7 +269,7 @@ class BargeIn:
         self._somebody |= self._evidence >= (0.0 if late else self._bound)
         # while the robot lowers its voice, only what follows tells whether it was the robot
         self._certain = self._somebody and (not self._asks or self._evidence >= self._sure)
-        return self._somebody or (self._evidence > -self._bound and not late)
+        return self._somebody or (self._evidence > self._before - self._bound and not late)
 
 
 def human_probability(probability: float) -> float:

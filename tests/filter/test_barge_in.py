@@ -139,7 +139,27 @@ def test_a_robot_lowers_its_voice_once_in_a_second_at_most():
         suspected += talk.note(0.05 if i % hops else 0.9999, heard_after=5) == "speech_suspected"
         asking.append(talk.asking)
     begins = np.flatnonzero(np.diff(np.array(asking, int), prepend=0) == 1)
-    assert suspected == begins.size > 40 and np.diff(begins).min() * HOP_S >= 1.0 - HOP_S
+    assert suspected > begins.size > 40 and np.diff(begins).min() * HOP_S >= 1.0 - HOP_S
+
+
+@pytest.mark.parametrize(
+    ("suspected", "lower", "asks_at", "right"),
+    [
+        (0.985, 0.985, 7, "speech_started"),  # 0.7 of log-odds a hop: from -2.2 to 2.2
+        (0.985, 0.3, 7, "speech_dismissed"),
+        (0.971, 0.971, None, "speech_dismissed"),
+    ],
+)
+def test_within_a_second_of_a_question_a_robot_asks_again_only_whom_the_sum_believes(suspected, lower, asks_at, right):
+    talk = BargeIn(HOP_S)
+    first = [talk.note(probability, heard_after=5) for probability in [0.9999] * 5 + [0.05] * 19]
+    assert first[0] == "speech_suspected" and first[-1] == "speech_dismissed"
+    told, asking = [], []
+    for probability in [suspected] * 13 + [lower] * 20:
+        told.append(talk.note(probability, heard_after=5))
+        asking.append(talk.asking)
+    assert [each for each in told if each][:2] == ["speech_suspected", right]
+    assert (asking.index(True) if any(asking) else None) == asks_at
 
 
 def test_what_is_believed_to_be_a_human_is_no_mistake_and_nothing_is_learned_while_the_robot_is_silent():
