@@ -31,9 +31,9 @@ class Output(NamedTuple):
 class Robot(NamedTuple):
     """A robot that lowers its voice by ask_db when the filter asks for it.
 
-    echo: (n,), its voice as the microphone recorded it or, where a lower voice distorts less, what `softened` returns. late: delay
-    of the echo behind the reference, samples.
-    file: where to write what it plays (left) and what its microphone hears (right). device: what processes the microphone's sound.
+    echo: (n,), its voice as the microphone recorded it or, of a simulated loudspeaker, which distorts less when softer, what `softened`
+    returns. late: delay of the echo behind the reference, samples.
+    file: where to write what it plays (left) and what its microphone hears (right). device: the microphone's own processing.
     """
 
     echo: Samples

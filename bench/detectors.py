@@ -21,7 +21,7 @@ from edgefilter.types import SAMPLE_RATE, Event, Samples
 Step: TypeAlias = Callable[[Samples], float]
 """The probability of speech after the next hop (hop,)."""
 THRESHOLD = 0.5
-"""Probability from which on speech begins: the default of all of them."""
+"""Probability from which on a sound is speech: the default of all three detectors."""
 HELD_S = 0.2
 """How long speech must last where a detector is not believed at once, as voice agents do."""
 

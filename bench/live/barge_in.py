@@ -77,7 +77,7 @@ COUGH_DB = 3.0
 MONOLOGUE_S = 60.0
 """Of robot speech, before the next robot begins in the next room."""
 AUDIBLE = 1e-3
-"""A second of a real recording counts as speech where the reference is within 30 dB of its loudest second."""
+"""A second of a real recording counts as robot speech where the reference has at least this share of the power of its loudest second, -30 dB."""
 POLICIES = {
     "muted": "microphone muted while the robot speaks",
     "open": "open loop: the robot talks on",
@@ -225,7 +225,7 @@ def early_errors(spoken: Sequence[str], recognised: Sequence[str], first: int) -
 def monologues(
     folders: list[Path], minutes: float, seed: int, engine: str, ask_db: float, microphone: str | None, kept: Cache, of: object
 ) -> list[dict]:  # fmt: skip
-    """A row for each robot, until they have spoken for so many minutes; each voice goes on where it stopped."""
+    """A row for each robot that talks alone, until all have spoken for so many minutes; a voice that is used again goes on where it stopped."""
     voices = read_voices(folders) if folders else {}
     order = np.random.default_rng(seed)
     clips = {name: [found[i] for i in order.permutation(len(found))] for name, found in voices.items()}
@@ -314,7 +314,8 @@ def run(options: argparse.Namespace) -> str:
                           f"noticed within {IN_TIME_S} s, %", lines, "o-", ylim=(0, 102))  # fmt: skip
     notes = f"Engine `{engine}`, default threshold. Humans 20-28 dB below the robot that talks meanwhile."
     if options.ask_db:
-        notes += f" The robot asks: it lowers its voice by {options.ask_db:g} dB, and a recorded one all that its recording holds."
+        notes += f" The robot asks: it lowers its voice by {options.ask_db:g} dB when the filter suspects a human."
+        notes += " Of a recorded robot the whole recording becomes softer."
     part = "_".join(("barge_in", *filter(None, [microphone])))
     title = "Barge-in in closed loop" + (f", microphone: {microphone}" if microphone else "")
     return results.write(
@@ -324,7 +325,7 @@ def run(options: argparse.Namespace) -> str:
 
 
 def tables(rows: Sequence[Mapping], alone: Sequence[Mapping], points: Mapping[str, Sequence[Mapping]]) -> list[dict]:
-    """Noticed, words, backchannels, false stops, the curve over the threshold."""
+    """The tables: who was noticed, wrong words, backchannels, false stops, and both by the threshold of the probability."""
     p50, p90, holds = ("p50, s", 2), ("p90, s", 2), [f"still on {seconds} s later" for seconds in HOLDS_S]
     made = [
         results.table("barge-in", "Interruptions noticed",
@@ -333,7 +334,7 @@ def tables(rows: Sequence[Mapping], alone: Sequence[Mapping], points: Mapping[st
         results.table("backchannels", "Backchannels", ["", "n", "an event", f"within {IN_TIME_S} s", *holds],
                       [["an interruption", *lasting([row["calibrated"] for row in rows])],
                        *([what, *lasting([row["short"][kind] for row in rows])] for kind, what in SHORT.items())],
-                      "Open loop, calibrated, speech ended by 0.2 s of silence. The words are cut from the humans' first"
+                      "The robot talks on whatever happens and is calibrated; 0.2 s of silence end an event. The words are cut from the humans' first"
                       " syllables, the coughs are bursts of noise: stand-ins, not recordings of either."),
         results.table("false-stops", "False stops",
                       ["loudspeaker, filter", "robots", ("minutes of speech", 1), ("distinct", 1), "voices", "stops", ("an hour", 1),
@@ -363,7 +364,7 @@ def noticing(found: Sequence[Mapping]) -> list:
 
 
 def lasting(found: Sequence[Mapping]) -> list[int]:
-    """How many, how many began an event at all, in time, and are still on after each of HOLDS_S."""
+    """Counts: all, those with an event, those with one in time, and those whose event is still on so long after it began, for each of HOLDS_S."""
     begun = [one["lasts"] for one in found if one["lasts"] is not None]
     still = [sum(one[i] for one in begun) for i in range(len(HOLDS_S))]
     return [len(found), len(begun), sum(one["in_time"] for one in found), *still]

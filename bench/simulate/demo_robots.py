@@ -29,7 +29,7 @@ ROBOT_OVER_FAN_DB = 27.0
 
 @dataclass(frozen=True)
 class Hidden:
-    """One case: what is hidden, one after the other, how strongly, in whose voice."""
+    """One case: the effects that a recording of this voice holds, in the order in which sound meets them, and how strong they are."""
 
     name: str
     effects: tuple[str, ...]

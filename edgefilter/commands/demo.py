@@ -31,7 +31,7 @@ from edgefilter.session import filter_blocks
 from edgefilter.types import SAMPLE_RATE, Samples
 
 HUMAN_DB, HUMAN_AT_S = -20.0, 1.0
-"""Level of the human over the robot in the same seconds, and when the human begins to interrupt it."""
+"""Level of the human relative to the robot while both speak, dB, and when the human begins, s from the start."""
 
 
 def main(args: argparse.Namespace) -> None:
@@ -72,7 +72,7 @@ def _filter(args: argparse.Namespace) -> None:
         files = ["filtered.wav", *sounds]
         if plots := _drawer("plots"):
             drawn = {
-                "microphone: the robot talks, its fan runs, a human interrupts": mic,
+                "what the microphone hears: the robot talks, its fan runs, a human interrupts": mic,
                 "filtered: what edgefilter leaves of it": filtered,
                 "the human alone, for comparison": human,
             }
@@ -186,7 +186,7 @@ def _mend(name: str, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     lines = [
         "  SI-SDR of the human who interrupts it: {si_sdr_microphone_db:.1f} dB at the microphone, {si_sdr_before_db:.1f}"
         " dB with the profile as it was, {si_sdr_after_db:.1f} dB with better.npz".format(**figures),
-        "  listen to human_before.wav, in which the robot is still heard beside the human, and to human_after.wav",
+        "  listen to human_before.wav, in which the robot is still heard beside the human, and to human_after.wav, from which it is removed",
         f"what had been changed: {', '.join(case.truth['effects'])}",
         f"files in {folder}: {', '.join([*written, *drawn])}",
         "",

@@ -12,7 +12,7 @@ from edgefilter.types import EventKind
 
 Judge: TypeAlias = Literal["engine", "network"]
 INTERRUPTIONS: frozenset[EventKind] = frozenset({"speech_started"})
-"""The events at which a robot should stop."""
+"""The events at which a robot should stop talking."""
 SUSPICIONS: frozenset[EventKind] = frozenset({"speech_suspected", "speech_dismissed"})
 """Those at which it may lower its voice, or raise it again: somebody may speak, and nobody did."""
 CENTRE, SLOPE = 3.5, 1.25
@@ -28,8 +28,8 @@ USUAL_S, LEARNED_S = 40.0, 120.0
 how often it is, beside as many of a usual robot. Most of 200 simulated robots (12 s each) and 8 of 14 real devices never are, some
 every second or two: once in 13 s in the mean. Of simulated robots, and of real humans in time, 20 s and a minute give as many."""
 FALL = 2.0
-"""Rise of a threshold, in log-odds, that makes it e times as rare that a robot which talks alone exceeds it: 1.8 to 2.6 measured at
-thresholds from 1 to 3, of real and simulated robots."""
+"""Rise of the threshold, in log-odds, with which a robot that talks alone exceeds it 2.7 times (e) as rarely: 1.8 to 2.6 measured at
+log-odds from 1 to 3, of real and simulated robots."""
 UNASKED = 1e-4
 """Error rate of that test, log-odds of 9.2, at which a calibrated robot believes in a human without waiting for its lower voice to be
 heard. 124 simulated robots alone (recipe `field`, 25 minutes, closed loop): no sum that the lower voice has dismissed exceeded
@@ -115,7 +115,7 @@ class OwnVoice:
 
     @property
     def higher(self) -> float:
-        """Further log-odds that a human needs beside this robot, so that it raises as few false suspicions as a usual robot."""
+        """By how much this robot raises the threshold, log-odds, so that its own voice causes no more false suspicions than a usual robot's."""
         return FALL * math.log((1.0 + self._peaks / self._usual) / (1.0 + self._hops / self._memory))
 
     @property

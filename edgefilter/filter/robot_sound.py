@@ -36,7 +36,7 @@ class RobotSound:
         self.forget()
 
     def forget(self) -> None:
-        """The reference plays: what is heard without it begins anew."""
+        """The reference plays again: forget what was heard while it was silent."""
         self._other, self._count = np.zeros(self._edges.size), 0
 
     def learn(self, power: Samples) -> None:

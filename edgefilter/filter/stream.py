@@ -148,7 +148,7 @@ class Stream:
         return self._deliver(rest[:, :missing])
 
     def _expect(self, microphones: int | None) -> None:
-        """Be ready for that many microphones, None for one; raises SignalError where they, or the profile's, are others."""
+        """Be ready for that many microphones, None for one; raises SignalError where the recording so far, or the profile, has another number."""
         if self.samples_in == 0:
             known = 1 if self.profile is None else self.profile.microphones
             if self.profile and known != (microphones or 1):
@@ -163,7 +163,7 @@ class Stream:
                 self._microphones = microphones
         if microphones != self._microphones:
             found = f"mic has {microphones or 1} channels after {self._microphones or 1}"
-            raise SignalError(f"{found}, expected as many to the end: call reset() before another recording")
+            raise SignalError(f"{found}, expected the same number until the end: call reset() before another recording")
 
     def _deliver(self, out: Samples) -> Samples:
         """Of the finished samples of both sounds (2, n), behind those that are kept, the one that was asked for.
@@ -288,7 +288,7 @@ class Stream:
             seconds = engine.longest * engine.stft.hop / SAMPLE_RATE
             raise SignalError(
                 f"the recording is longer than {seconds:.0f} s, which is all that engine {engine.name} takes at"
-                " once: cut it or take another engine"
+                " once: shorten the recording or take another engine"
             )
 
 

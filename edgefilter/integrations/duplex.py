@@ -246,7 +246,10 @@ class Duplex:
         """As `hear`, for 16-bit samples, interleaved; answers: channels of the answer, each of them the human, None: as came in."""
         if channels > 1 and self._wanted is None and not self._averaged:
             self._averaged = True
-            _LOGGER.warning("%d channels averaged to one: name the microphones of an array (mic_channels)", channels)
+            _LOGGER.warning(
+                "%d channels averaged to one: if they are a microphone array, give the numbers of its channels (mic_channels)",
+                channels,
+            )
         samples = from_pcm16(pcm, channels) if self._wanted is None else of_pcm16(pcm, channels)
         return as_pcm16(self.hear(samples, rate, at_s), answers or channels)
 
@@ -295,12 +298,12 @@ class Duplex:
         deaf, self._deaf = self._deaf, self.ego.speech_probability is None
         if self._deaf and not deaf:
             _LOGGER.warning(
-                "engine %s judges no speech: the human is not noticed. EgoFilter(barge_in=BargeInSettings(judge="
-                "'network')) always has one that does",
+                "engine %s detects no speech: the human is not noticed. With EgoFilter(barge_in=BargeInSettings(judge="
+                "'network')) every engine notices one",
                 self.ego.engine_name,
             )
         elif deaf and not self._deaf:
-            _LOGGER.warning("engine %s judges speech: the human is noticed again", self.ego.engine_name)
+            _LOGGER.warning("engine %s detects speech: the human is noticed again", self.ego.engine_name)
 
     def _paired(self) -> tuple[Samples, Samples]:
         """The samples of the microphone that need not wait, and what was played while they were recorded."""
@@ -358,7 +361,7 @@ class Pace:
     >>> now = iter(range(100))
     >>> pace = Pace(lambda: float(next(now)))
     >>> [said for said in (pace.note(32000, 16000) for _ in range(20)) if said]
-    ['it brings 32000 samples a second and is said to have 16000: give the rate or the channels that it has']
+    ['it brings 32000 samples a second and is said to have 16000: give the rate and the number of channels that it really has']
     """
 
     def __init__(self, clock: Callable[[], float]) -> None:
@@ -383,7 +386,7 @@ class Pace:
             return ""
         self._said = factor
         brings = f"it brings {factor * rate:.0f} samples a second and is said to have {rate}"
-        return f"{brings}: give the rate or the channels that it has"
+        return f"{brings}: give the rate and the number of channels that it really has"
 
 
 def from_pcm16(pcm: bytes | memoryview, channels: int = 1) -> Samples:

@@ -317,7 +317,9 @@ class _Speaker(_Client):
         self._said.put_nowait(message)
 
     async def handle_event(self, event: Message) -> bool:
-        while self._waiting_bytes > MOST_BYTES:  # meanwhile the connection is read no further
+        while (
+            self._waiting_bytes > MOST_BYTES
+        ):  # nothing more is read from the connection meanwhile, so its sender has to wait
             await asyncio.sleep(AHEAD_S)
         if AudioStart.is_type(event.type):
             self._ignored = False
@@ -410,7 +412,7 @@ class _Recogniser(_Client):
 
 
 class Player:
-    """A loudspeaker, a command or the service at a URI, that can be silenced; it opens again with the next sound."""
+    """Plays sound on a loudspeaker, through a command or to the service at a URI; when silenced it closes, and the next sound opens it again."""
 
     def __init__(self, where: str, form: AudioFormat) -> None:
         self.where, self.form = where, form
@@ -470,7 +472,7 @@ def _size_of(message: AudioChunk | AudioStop | None) -> int:
 
 
 def _chunk_of(message: Message) -> AudioChunk:
-    """The sound in a message, at 16 bits; raises SignalError where the message does not say what it is or is cut."""
+    """The sound in a message, converted to 16 bits; raises SignalError where its rate, width or channels are missing, or half a sample."""
     rate, width, channels = (cast(int, message.data.get(key)) for key in ("rate", "width", "channels"))
     size = len(message.payload or b"")
     whole = rate in RATES and width in (1, 2, 3, 4) and channels in range(1, size + 2)

@@ -104,7 +104,7 @@ def test_other_microphones_than_were_calibrated_are_one_line() -> None:
         EgoFilter(calibration(3), engine="ss").process(mic[:, 0], ref)
     ego = EgoFilter(engine="ss")
     ego.process(mic[:1000], ref[:1000])
-    with pytest.raises(SignalError, match="mic has 2 channels after 3, expected as many to the end"):
+    with pytest.raises(SignalError, match="mic has 2 channels after 3, expected the same number until the end"):
         ego.process(mic[1000:2000, :2], ref[1000:2000])
     with pytest.raises(SignalError, match=r"shape \(10, 9\), expected .* 1 to 8 channels"):
         ego.process(np.zeros((10, 9), np.float32), ref[:10])

@@ -375,7 +375,7 @@ def test_an_engine_that_judges_no_speech_is_told_of_once_and_so_is_its_end(witne
         witness.speech_probability = probability
         listen(duplex, 0.1)
     told = [record.getMessage() for record in caplog.records]
-    assert len(told) == 2 and "witness judges no speech: the human is not noticed" in told[0]
+    assert len(told) == 2 and "witness detects no speech: the human is not noticed" in told[0]
     assert "noticed again" in told[1]
 
 
@@ -383,7 +383,7 @@ def test_a_filter_that_steps_down_to_an_engine_that_judges_no_speech_says_so(cap
     ego = EgoFilter(budget_ms=1e-6)
     assert not ego.judges_speech
     listen(Duplex(ego), 1.0)
-    assert "judges no speech: the human is not noticed" in caplog.text
+    assert "detects no speech: the human is not noticed" in caplog.text
 
 
 @pytest.mark.parametrize(
