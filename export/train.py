@@ -44,7 +44,7 @@ def smoke(options: argparse.Namespace) -> None:
     for folder in (options.data, options.validation):
         folder.mkdir(parents=True, exist_ok=True)
         for index in range(2):
-            human, robot = (rng.standard_normal(3 * SAMPLE_RATE).cumsum() % 7 - 3 for _ in range(2))
+            human, robot = (rng.standard_normal(3 * SAMPLE_RATE // 2).cumsum() % 7 - 3 for _ in range(2))
             signals = {"mic": human + 9 * robot, "error": human + robot, "reference": 9 * robot, "clean": human}
             signals["fan"] = 0 * human
             packed = {name: np.round(1000 * samples).astype(np.int16) for name, samples in signals.items()}
@@ -52,7 +52,7 @@ def smoke(options: argparse.Namespace) -> None:
             powers = {name: np.full(shape, level, np.uint8) for name, level in (("noise", 60), ("residual", 90))}
             scales = {name: np.float32(0.9) for name in ("scale", "reference_scale")}
             np.savez(folder / f"{index:05d}.npz", **packed, **powers, **scales)
-    options.steps, options.every, options.batch, options.seconds = 4, 2, 2, 0.7
+    options.steps, options.every, options.batch, options.seconds = 4, 2, 2, 0.35
 
 
 def arguments(argv: list[str] | None = None) -> argparse.Namespace:

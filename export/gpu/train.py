@@ -47,7 +47,7 @@ KEEP_S = 50.0
 """A machine that is lent may end at any moment: no more than a minute of training is lost, with the step under way."""
 USUAL = {"--rate": "1e-3", "--batch": "64", "--every": "100", "--steps": "1000000", "--fan-kept": "0.2"}
 """Options of export.train that are others here: those of the shipped network's training, and ends by the clock."""
-SMOKE = {"--batch": "2", "--every": "2", "--steps": "4", "--seconds": "0.45"}
+SMOKE = {"--batch": "2", "--every": "2", "--steps": "4", "--seconds": "0.25"}
 
 
 class Pool(Items):
@@ -120,7 +120,7 @@ def arguments(argv: list[str] | None) -> tuple[argparse.Namespace, list[str]]:
 def run(options: argparse.Namespace, more: list[str], began: float) -> None:
     recipe = RECIPES[options.recipe]
     if options.smoke:
-        recipe = replace(recipe, seconds=2.0)
+        recipe = replace(recipe, seconds=1.0)
         options.rendered, options.pool, options.held_out = 4, 6, 2
     options.output.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as temporary:

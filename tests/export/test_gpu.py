@@ -120,6 +120,14 @@ def archive(folders, tmp_path_factory):
     return path
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_devices():
+    """Scenes draw that many when they are made, which takes longer than what most tests look at."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("export.gpu.scenes.COLOURS", 8)
+        yield
+
+
 @pytest.fixture(scope="module")
 def scenes(archive, tmp_path_factory):
     folder = tmp_path_factory.mktemp("unpacked")
@@ -237,7 +245,8 @@ def test_the_minutes_of_a_gpu_in_miniature(archive, tmp_path):
     """As a program, on a machine that has little: what it does not need cannot be imported."""
     absent = ("pyroomacoustics", "soxr", "sounddevice", "matplotlib", "jinja2", "dask", "ctranslate2")
     code = (
-        f"import sys; sys.modules.update(dict.fromkeys({absent})); from export.gpu.train import main; sys.exit(main())"
+        f"import sys; sys.modules.update(dict.fromkeys({absent})); from export.gpu import scenes, train;"
+        " scenes.COLOURS = 8; sys.exit(train.main())"
     )
     words = ["--speech", str(archive), "--output", str(tmp_path / "out"), "--smoke"]
     done = subprocess.run([sys.executable, "-c", code, *words], cwd=ROOT, capture_output=True, text=True)
