@@ -215,10 +215,11 @@ class FreeGain(FreeLaw):
                 parts = hats(level, knots(times))
                 return _solved((parts * energy) @ parts.T, parts @ cross, bends)[1]
 
-            levels = _levels(x, settings)
-            return settings[int(np.argmax([worth(*pair) for pair in zip(levels, settings, strict=True)]))]
+            new = [times for times in settings if times not in known]
+            known.update(zip(new, map(worth, _levels(x, new), new), strict=True))
+            return max(settings, key=known.__getitem__)
 
-        times = Times(1.0, 1.0)
+        times, known = Times(1.0, 1.0), dict[Times, float]()
         for _ in range(2):
             times = best([replace(times, attack_ms=a, release_ms=r) for a, r in product(ATTACKS_MS, RELEASES_MS)])
             for ratio in FINER:
@@ -506,10 +507,9 @@ def _levels(x: Samples, settings: Sequence[Times], before_db: float = FLOOR_DB) 
     for level, times in zip(levels, settings, strict=True):
         wanted = powers[times.peak][np.minimum(steps + times.ahead_ms, steps.size - 1)] ** times.exponent
         rising, falling = (-math.expm1(-1.0 / ms) for ms in (times.attack_ms, times.release_ms))
-        now, smoothed = 10.0 ** (before_db / 10.0 * times.exponent), []
-        for step in wanted.tolist():  # plain numbers: arrays of one cost ten times as much
-            now += (rising if step > now else falling) * (step - now)
-            smoothed.append(now)
+        now = 10.0 ** (before_db / 10.0 * times.exponent)
+        # plain numbers: arrays of one cost ten times as much
+        smoothed = [now := now + (rising if step > now else falling) * (step - now) for step in wanted.tolist()]
         level[:] = 10.0 * np.log10(smoothed) / times.exponent
     return levels
 
