@@ -162,11 +162,12 @@ def find_drift(recording: Samples, reference: Samples) -> tuple[float, int]:
         row[:] = correlation_near(cross, FIT.upsampled * size, reach)
     grid = np.arange(-FIT.most_ppm, FIT.most_ppm + FIT.step_ppm, FIT.step_ppm)
     middles = starts + SAMPLE_RATE / 2
-    sums = np.empty((grid.size, rows.shape[1]))
+    twice, width, sums = np.hstack((rows, rows)), rows.shape[1], np.zeros((grid.size, rows.shape[1]))
     for line, ppm in zip(sums, grid, strict=True):
         moves = np.round(-ppm * 1e-6 * middles * FIT.upsampled).astype(int)
-        at = (np.arange(rows.shape[1]) + moves[:, None]) % rows.shape[1]
-        line[:] = np.abs(np.take_along_axis(rows, at, axis=1).sum(axis=0))
+        for row, at in zip(twice, moves % width, strict=True):
+            line += row[at : at + width]
+    np.abs(sums, out=sums)
     heights = sums.max(axis=1)
     best = int(np.argmax(heights))
     if heights[best] < FIT.drift_gain * heights[grid.size // 2]:
