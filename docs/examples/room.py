@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import soundfile
-from scipy.signal import fftconvolve
 
 import edgefilter
 
@@ -70,7 +69,7 @@ class Room:
         out[: self.buffer.size] = self.buffer[:count]
         self.buffer = self.buffer[count:]
         self.played.append(out)
-        echo = np.concatenate((np.zeros(self._lag, np.float32), fftconvolve(out, self.response)))
+        echo = np.concatenate((np.zeros(self._lag, np.float32), np.convolve(out, self.response)))
         echo[: self._tail.size] += self._tail  # never longer: as many samples have gone from it as come now
         self._tail = echo
         mic = self._tail[:count] + self.fan[(self.now + np.arange(count)) % self.fan.size] + self.human(count)

@@ -16,7 +16,6 @@ ROOT = Path(__file__).parents[2]
 sys.path.append(str(ROOT / "docs/examples"))
 
 import room as simulated  # noqa: E402
-from scipy.signal import resample_poly  # noqa: E402
 from sic_framework import SICComponentManager, SICConfMessage  # noqa: E402
 from sic_framework.core.connector import SICConnector  # noqa: E402
 from sic_framework.core.message_python2 import AudioMessage, AudioRequest  # noqa: E402
@@ -41,6 +40,8 @@ def messages():
         heard.append(ROOM.hear(FRAME))
     sound, rate = np.concatenate(heard), 16000
     if FOUR:
+        from scipy.signal import resample_poly  # takes a second
+
         rate, own = 48000, 0.1 * np.std(ROOM.fan) * np.random.default_rng(5).standard_normal((4, 3 * sound.size))
         sound = np.stack([np.roll(resample_poly(sound, 3, 1), 9 * at) for at in range(4)], axis=1) + own.T
     pcm = np.rint(sound * 32767).astype("<i2")
