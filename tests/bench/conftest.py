@@ -120,6 +120,13 @@ def clip_of(seconds: float, text: str | None = None) -> Clip:
     return Clip("set", "lab", Scene(Signals(robot + human, robot, human, slice(start, human.size))), "s", "p", text)
 
 
+def beginning(clip: Clip, seconds: float = 4.0) -> Clip:
+    """The clip with so much of its signals alone."""
+    size, signals = int(seconds * RATE), clip.signals
+    clip.signals = Signals(*(None if x is None else x[:size] for x in signals[:3]), signals.span)
+    return clip
+
+
 @pytest.fixture
 def pairs(tmp_path: Path) -> Path:
     """Two recordings of one robot alone, one of each other kind; loopbacks a little shorter, as in reality."""

@@ -21,7 +21,7 @@ from edgefilter import PathLearner, enhance
 from edgefilter.dsp.metrics import si_sdr
 from edgefilter.engines import create
 from edgefilter.errors import UsageError
-from tests.bench.conftest import RATE, rows_of
+from tests.bench.conftest import RATE, beginning, rows_of
 
 ROWS = "unfiltered,linear-uncalibrated,fan-kept,clean,dtln-aec"
 RATES = {"unfiltered": 120, "paper-ss": 20, "crnn": 40, "aec3": 80, "clean": 0}
@@ -303,7 +303,7 @@ def test_pitch_and_talking() -> None:
 
 def test_engines_that_tell_who_speaks_have_events_and_others_none(pairs: Path) -> None:
     (clip,) = named([recorded_clip(one) for one in find_recordings(pairs) if one.name == "device1_00"], "alone")
-    known = systems.catalogue()
+    known, clip = systems.catalogue(), beginning(clip)
     assert known["linear-uncalibrated"].run(clip).events is None
     told = known["crnn-uncalibrated"].run(clip)
     assert (
@@ -328,7 +328,7 @@ def test_a_robot_that_is_asked_lowers_its_voice_by_what_is_asked(pairs: Path, mo
 
 def test_the_sound_for_people_is_a_row_of_its_own_for_who_asks(pairs: Path) -> None:
     (clip,) = named([recorded_clip(one) for one in find_recordings(pairs) if one.name == "device1_00"], "alone")
-    known = systems.catalogue()
+    known, clip = systems.catalogue(), beginning(clip)
     heard, listened = (known[f"crnn{sound}-uncalibrated"].run(clip) for sound in ("", "-listen"))
     assert (known["crnn-listen"].knows, known["crnn-listen-uncalibrated"].knows) == ("calibration", "neither")
     assert np.mean(listened.samples**2) < np.mean(heard.samples**2) and listened.probability == heard.probability
@@ -363,7 +363,7 @@ def test_the_papers_network_filters_what_has_a_calibration_or_says_why_not(
     )
     assert f"({sizes['parameters'] / 1e6:.1f} of 34 M parameters)" in row.title
     assert (sizes["filters"], sizes["lstm"], sizes["hidden"]) == ([16] * 7 + [2], 80, 150)  # as its command says
-    clip = evaluate.find_clips(options(live, live))[0]
+    clip = beginning(evaluate.find_clips(options(live, live))[0])
     np.testing.assert_array_equal(
         row.run(clip).samples, enhance(clip.mic, clip.ref, clip.profile, engine="paper-crnn", model=row.model)
     )

@@ -42,11 +42,11 @@ def test_the_fit_is_right_about_odds_whatever_the_share_of_humans(known):
 
 @pytest.mark.slow
 def test_scale_and_bias_bring_the_threshold_of_so_many_false_starts_to_the_filters(known):
-    minutes = np.full(600 * 16_000 // 256, -9.0)
-    for at, odds in ((10_000, 2.0), (30_000, 3.0)):
+    minutes = np.full(300 * 16_000 // 256, -9.0)
+    for at, odds in ((5_000, 2.0), (15_000, 3.0)):
         minutes[at : at + 40] = odds
     alone = Listened("real", minutes, np.zeros(minutes.size, bool), 256)
-    one, none = (sparing([alone, known], 1.0, 1.2, false_starts) for false_starts in (6, 0))  # an hour
+    one, none = (sparing([alone, known], 1.0, 1.2, false_starts) for false_starts in (12, 0))  # an hour
     assert expit(1.2 * (2.0 - 1.0)) < one < expit(1.2 * (2.0 - 1.0)) + 0.01
     assert expit(1.2 * (3.0 - 1.0)) < none < expit(1.2 * (3.0 - 1.0)) + 0.01
     by = platt(1.0, 1.2, one)
@@ -57,8 +57,8 @@ def test_scale_and_bias_bring_the_threshold_of_so_many_false_starts_to_the_filte
 
 
 def test_the_curve_counts_false_starts_an_hour_and_who_is_noticed(known):
-    minutes = np.full(600 * 16_000 // 256, -9.0)
-    for at in (10_000, 30_000):
+    minutes = np.full(300 * 16_000 // 256, -9.0)
+    for at in (5_000, 15_000):
         minutes[at : at + 40] = 2.0  # logit 1.2 by the fit below: 0.77
     alone = Listened("real", minutes, np.zeros(minutes.size, bool), 256)
     odds = np.where(np.arange(400) >= 105, 9.0, -9.0)  # 5 hops behind the onset
@@ -66,7 +66,7 @@ def test_the_curve_counts_false_starts_an_hour_and_who_is_noticed(known):
     late = human._replace(odds=np.roll(odds, 60))
     louder = late._replace(ser=0.0)  # not among those that the page tells of
     points = {point["threshold"]: point for point in curve([alone, human, late, louder], 1.0, 1.2)}
-    assert points[0.7]["an_hour"] == pytest.approx(12.0, rel=0.01) and points[0.9]["an_hour"] == 0
+    assert points[0.7]["an_hour"] == pytest.approx(24.0, rel=0.01) and points[0.9]["an_hour"] == 0
     assert points[0.97]["noticed"] == 0.5
     found = {
         "centre": 1.0,
@@ -82,7 +82,7 @@ def test_the_curve_counts_false_starts_an_hour_and_who_is_noticed(known):
     curves = {"curve_before": as_it_is, "curve": list(points.values())}
     fits, _, by_threshold = tables({"real": {**found, **curves, "humans": 2, "audible": 1}})
     assert [results.cell(x, 2) for x in fits["rows"][0][:6]] == ["real", "1.00", "1.20", "0.97", "0.96", "2.54"]
-    assert [results.cell(x, 0) for x in by_threshold["rows"][1][1:]] == ["0", "50", "12", "50"]
+    assert [results.cell(x, 0) for x in by_threshold["rows"][1][1:]] == ["0", "50", "24", "50"]
     assert by_threshold["text"].startswith("Of 2 humans 1 can be noticed so soon")
 
 
