@@ -108,10 +108,10 @@ async def running(microphone, loudspeaker):
 
 
 def logged(caplog):
-    """Warnings and errors, but for the filter's (it judges no speech, the machine may be too slow, two channels) and asyncio's own."""
+    """Warnings and errors, but for the filter's (it detects no speech, the machine may be too slow, two channels) and asyncio's own."""
     told = [record.getMessage() for record in caplog.records if record.levelname in ("WARNING", "ERROR")]
     # the last words: of a process that an earlier test has ended
-    others = "judges no speech", "too slow", "averaged", "that handles pid"
+    others = "detects no speech", "too slow", "averaged", "that handles pid"
     return [line for line in told if not any(words in line for words in others)]
 
 
