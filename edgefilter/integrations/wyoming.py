@@ -317,10 +317,8 @@ class _Speaker(_Client):
         self._said.put_nowait(message)
 
     async def handle_event(self, event: Message) -> bool:
-        while (
-            self._waiting_bytes > MOST_BYTES
-        ):  # nothing more is read from the connection meanwhile, so its sender has to wait
-            await asyncio.sleep(AHEAD_S)
+        while self._waiting_bytes > MOST_BYTES:
+            await asyncio.sleep(AHEAD_S)  # nothing more is read from the connection meanwhile: its sender has to wait
         if AudioStart.is_type(event.type):
             self._ignored = False
         elif AudioStop.is_type(event.type):
@@ -472,7 +470,7 @@ def _size_of(message: AudioChunk | AudioStop | None) -> int:
 
 
 def _chunk_of(message: Message) -> AudioChunk:
-    """The sound in a message, converted to 16 bits; raises SignalError where its rate, width or channels are missing, or half a sample."""
+    """The sound in a message, converted to 16 bits; raises SignalError where rate, width or channels are missing, or it ends within a sample."""
     rate, width, channels = (cast(int, message.data.get(key)) for key in ("rate", "width", "channels"))
     size = len(message.payload or b"")
     whole = rate in RATES and width in (1, 2, 3, 4) and channels in range(1, size + 2)
