@@ -29,8 +29,8 @@ _PACKAGE = Path(__file__).parent.parent
 FOLDERS = (_PACKAGE / "models", _PACKAGE.parent / "models")
 """Where models lie: inside the installed package, or at the top of a checkout."""
 SHIPPED = {
-    "crnn.onnx": "76a44dbb9b168afbcea34928b66dbb64d224704933dfd7d5b5bd95eb9eda4070",
-    "crnn_int8.onnx": "77d836fb4871b2a8cbd32c5a151442eb6e12df80a7ce33f8f4e78e7ff3e5faa4",
+    "crnn.onnx": "558e33f5e5df808df886e0929ed94e42a32e5267cbd11f93e1f98298e86e318e",
+    "crnn_int8.onnx": "c79a6a4531d9a5acbdf3444ae973c605bb88966ef676a374861b8c5b4c3c3922",
 }
 """sha256 of the files in models/, as MODELS.md lists them."""
 MOST_BYTES, MOST_STATE, MOST_FFT = 512 * 2**20, 1 << 22, 1 << 14

@@ -39,7 +39,7 @@ from export.simulate.recipe import RECIPES
 from export.tasks import EdgeTask
 from export.trainer import Plan, Trainer, write_whole
 
-NEWEST = Path(__file__).parents[2] / "models" / "version2_bands_step37534.pt"
+NEWEST = Path(__file__).parents[2] / "models" / "version2_bands_step38834.pt"
 """The checkpoint that training goes on from."""
 VALIDATION_SEED = 102
 """Of the validation items, whatever the training's seed."""

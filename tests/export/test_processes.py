@@ -48,7 +48,7 @@ def test_two_processes_step_along_the_mean_of_their_gradients(tmp_path):
     assert found["step"] == 3 and len((tmp_path / "run" / "log.jsonl").read_text().splitlines()) == 1
 
     task = EdgeTask(OPTIONS)
-    plan, shape = Plan(steps=3, rate=1.5e-3, seed=1, every=3, patience=0), Shape(2, 0.5)
+    plan, shape = Plan(steps=3, rate=1.5e-3, seed=1, every=3, patience=0), Shape(2, 0.5, long_every=0)
     alone = Trainer(task, plan, shape, tmp_path / "alone")
     before = {name: value.clone() for name, value in alone.network.state_dict().items()}
     items = Items(tmp_path / "d")

@@ -22,6 +22,7 @@ import pytest
 import soxr
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.protocol import State
 
 from edgefilter import EgoFilter, SignalError, enhance
 from edgefilter.cli import main
@@ -79,7 +80,8 @@ async def served(service):
 
 async def converse(address, hello, messages):
     """Send all messages, then the end; the sound that came back and what was told."""
-    async with connect(address, compression=None, max_size=None) as server:
+    server = await connect(address, compression=None, max_size=None)
+    try:
         await server.send(json.dumps(hello))
 
         async def speak():
@@ -94,6 +96,9 @@ async def converse(address, hello, messages):
                 sound.append(answer) if isinstance(answer, bytes) else told.append(json.loads(answer))
         speaking.cancel()
         return sound, told
+    finally:
+        if server.state is not State.CLOSED:  # Python 3.11 fails to abort a transport that closed with unsent bytes
+            await server.close()
 
 
 def heard(hello, messages, **words):
