@@ -26,8 +26,8 @@ LIKELY_LAG_S = 2.0
 LATE = SAMPLE_RATE // 10
 """Samples by which a reference may come after its echo and is still found for an utterance; with LATEST they are found .15 s later."""
 LATEST, FURTHEST = 2 * SAMPLE_RATE, 5 * SAMPLE_RATE
-"""Range of a look, a search for the lag that does not need the beginning of an utterance, in samples: by how much the reference may come
-after its echo, and the longest lag; one beyond MOST_LAG_S is reported to the user, and nothing is removed there."""
+"""Range of a look, which is a search for the lag that needs no beginning of an utterance: by how many samples the reference may come
+after its echo, and the longest lag. A lag beyond MOST_LAG_S is reported to the user, and its echo is not cancelled."""
 LOOKS, FIRST_LOOK = 12, SAMPLE_RATE // 2
 """Looks that are remembered, and samples of an utterance after which there is one; each LOOK another, and one more at each realignment.
 Speech that begins while the reference is silent waits for as long until it is nobody's but a human's: the reference may follow."""
@@ -162,7 +162,7 @@ class Aligner:
         return kept
 
     def step(self, mic: Samples, ref: Samples) -> Aligned:
-        """Take the next hop (hop,) of microphone and reference, of an array (microphones, hop)."""
+        """Align the next hop: ref (hop,) with mic (hop,), or (microphones, hop) of an array."""
         ref = self._announced.reference(ref, self._ref.end)
         heard = np.atleast_2d(mic)
         for buffer, samples in zip(self._mics, heard, strict=True):
@@ -218,7 +218,7 @@ class Aligner:
         return bool((self._belief.late[-1:] + self._belief.beyond[-1:] > 0.5).any())
 
     def _certain(self, found: Found) -> bool:
-        """Whether a search is to be believed, also against a lag that is certain but not followed."""
+        """Whether the lag of a search is accepted; while the robot is rather heard at a lag that is not followed, it needs the square of the odds."""
         return self._odds(found) > CERTAIN * (CERTAIN if self._displaced else 1.0)
 
     def _odds(self, found: Found) -> float:
@@ -288,7 +288,7 @@ class Aligner:
         return 1.0 / (1.0 + math.exp(-self._log_odds)) if self._known else 0.0
 
     def _state(self) -> AlignmentState:
-        """What `Aligned` says of each."""
+        """The present state, one of those that `Aligned` describes."""
         if self._expected is not None:
             return "announced"
         if self._coarse:
@@ -303,7 +303,7 @@ class Aligner:
         return "locked" if self._known and self._log_odds >= 0.0 else "unfound"
 
     def _audible(self) -> bool:
-        """Whether something of the reference can still be heard."""
+        """Whether the microphone may still hear some of the reference, which takes the lag and its reverberation to fade."""
         reach = self._max_lag if not self._known else max(int(self._drift.delay), 0) + SAMPLE_RATE // 4
         return self._onsets.current.end + reach >= self._ref.end
 
@@ -338,7 +338,7 @@ class Aligner:
         return bool(switched)
 
     def _look_anywhere(self) -> Iterator[bool]:
-        """Look at the latest sound and suppose nothing of it; a step at a time."""
+        """Search the latest sound over the full range of lags, without a prior; each step yields whether the delay was switched."""
         sounds = self._ref.end - self._onsets.current.end <= SEARCH_STRIDE
         self._lags.prepare(self._ref, self._ref.end)
         yield False
@@ -355,9 +355,9 @@ class Aligner:
         yield sure and bool(self._open) and not self._known and self._take(found)
 
     def _look_for_utterance(self) -> Iterator[bool]:
-        """Look for the oldest unresolved utterance, or an announced one, a step at a time, each with whether the delay was switched.
+        """Search for the oldest utterance whose lag is unknown, or for an announced one; each step yields whether the delay was switched.
 
-        A sequential test (Wald 1945): each window of what was heard before changes the odds, until they are certain or too low.
+        A sequential test (Wald 1945): each earlier window of the microphone changes the odds, until the lag is accepted or rejected.
         """
         now = self._ref.end
         self._expected = None if self._open else self._announced.expected(now)

@@ -90,7 +90,7 @@ class Belief:
 
     @property
     def lossy(self) -> float:
-        """The odds that samples are missing in the reference, over those before anything was heard."""
+        """Odds that samples are missing in the reference, divided by the prior odds (Bayes factor)."""
         _, lost, arrivals = self.steps
         return 2.0 * float(np.prod(lost)) / (1.0 + float(np.prod(arrivals)))
 
@@ -135,7 +135,7 @@ def believe(recording: Samples, reference: Samples) -> Belief:
 
 
 def believed(looks: Sequence[Found]) -> Belief:
-    """What looks one after the other say of the lag, as `believe` has it; a running filter asks it of its latest ones."""
+    """Combine successive searches into one belief, by the rule of `believe`; a running filter gives its latest searches."""
     if not looks:
         none, never = np.zeros(0, int), np.zeros(0)
         return Belief(none, none, never, never, never, 0.0)

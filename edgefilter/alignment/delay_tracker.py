@@ -44,8 +44,9 @@ DRIFTED = 1.5
 """Samples. Two measurements that differ by less show the same jump; a jump of less is attributed to the clocks' drift, since a lost or
 repeated buffer makes a larger one."""
 EXPECTED, UNEXPECTED = 3.0, 5.0
-"""Standard deviations. An error of less than SMALL samples is drift up to EXPECTED, one of less than DRIFTED up to UNEXPECTED; a larger one
-contradicts the estimated delay. With 3 for both two of 16 simulated conversations lost 1.1 and .5 dB."""
+"""Gates, in standard deviations, for the measured delay less the predicted one. A difference of less than SMALL samples counts as drift up
+to EXPECTED, one of less than DRIFTED samples up to UNEXPECTED; any other contradicts the estimate. With 3 for both gates 2 of 16
+simulated conversations had 1.1 and 0.5 dB less SI-SDR."""
 SLOPE_DEVIATION = 150e-6
 """Standard deviation of the difference of the clocks of playback and capture before anything is heard, samples per sample. A difference of more
 than UNEXPECTED times this is not accepted."""
@@ -146,7 +147,7 @@ class DelayMeter:
         correlation = fourier.irfft(np.array(products), SIZE)
         likelihood = np.concatenate((correlation[:, -REACH:], correlation[:, :REACH]), axis=1).ravel()
         overlap = np.concatenate([_overlap(reference) for reference in references])
-        likelihood /= np.sqrt(overlap + 0.1 * overlap.max() + 1e-30)  # an offset has no difference
+        likelihood /= np.sqrt(overlap + 0.1 * overlap.max() + 1e-30)  # at the middle the delay is the expected one
         expected = likelihood.size // 2
         at, strength, ratio = max(
             (_highest(likelihood, reach) for reach in {REACH, expected}), key=lambda found: found[1] * found[2]
@@ -224,12 +225,12 @@ def _overlap(reference: Samples) -> Samples:
 
 
 class DriftFilter:
-    """Kalman filter over the delay (samples) and its slope (samples per sample), constant-slope model, and its jumps.
+    """Kalman filter that tracks the delay (samples) and its slope (samples per sample), constant but for jumps of the delay.
 
-    What a look claims of its own accuracy does not hold while a human talks as well or the response is still being
-    learnt: looks close to one another then err alike. So they weigh less the less they explain, and where looks that
-    agree contradict what is believed, belief is widened until it can follow them (fading memory, Sorenson & Sacks
-    1971).
+    The accuracy that a measurement reports is too optimistic while a human talks as well or the response is still being learnt:
+    the errors of measurements close to one another are then alike. So a measurement weighs less the less of the microphone it
+    explains, and where measurements agree with one another but contradict the estimate, its covariance grows until it can
+    follow them (fading memory, Sorenson & Sacks 1971).
     """
 
     def __init__(self) -> None:
@@ -251,7 +252,7 @@ class DriftFilter:
         self._witness.forget()
 
     def step(self, found: DelayMeasurement) -> None:
-        """The delay is another one by an offset; a small one may come from a wrong slope since the last look as well as from a jump."""
+        """Move the delay by the measured offset: it has jumped. A small offset may as well come from a wrong slope since the last measurement."""
         wrong = found.offset / max(self._since, STRIDE)
         if abs(found.offset) <= SMALL and abs(self.slope + wrong) < UNEXPECTED * SLOPE_DEVIATION:
             self._slope_variance = min(self._slope_variance + wrong**2, SLOPE_DEVIATION**2)
@@ -317,7 +318,7 @@ class DriftFilter:
         return measurement.variance + common + (1.0 if doubtful else 0.0)
 
     def _expected(self) -> tuple[float, float, float]:
-        """Covariance of the offset in the middle of the frame with the delay, with the slope, and its variance."""
+        """Covariances of the delay error at the middle of the frame with the delay and with the slope, and its own variance."""
         half = FRAME / 2.0
         delay = self._variance - half * self._covariance
         slope = self._covariance - half * self._slope_variance

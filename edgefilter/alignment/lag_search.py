@@ -80,7 +80,7 @@ class Found:
 
     @property
     def odds(self) -> float:
-        """That the robot arrives there, over that it does not, where it is as likely not to be heard at all."""
+        """Odds that the robot is heard at this lag; before the search it is as likely not to be heard at all."""
         return (self.clearness / EVEN) ** STEEP * self.prior
 
 
@@ -175,9 +175,9 @@ class LagSearch:
         return score
 
     def before(self, number: int, mic: DelayBuffer, ref: DelayBuffer | Playback, found: Found) -> Found:
-        """The lag with its odds after a look back at the microphone's window BETWEEN samples before, and with that window's end.
+        """The same lag with the odds after one more window of this microphone, which ends BETWEEN samples before the one that `found` is of.
 
-        No look counts for more than CERTAIN: a short sound of another may agree entirely.
+        One window raises the odds by a factor of CERTAIN at most: a short sound of another source may match the reference by chance.
         """
         stop = found.at - WINDOW - BETWEEN
         x = np.zeros(WINDOW + 2 * ASIDE, np.float32)

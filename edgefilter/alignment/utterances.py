@@ -13,8 +13,8 @@ from edgefilter.dsp.frames import SILENT, stretch
 from edgefilter.types import SAMPLE_RATE, AlignmentState, Samples
 
 PAUSE = SAMPLE_RATE // 5
-"""Samples of silence after which the lag may be another one: shorter than any pause between two playbacks, longer than
-a plosive."""
+"""Samples of silence in the reference after which the lag may have changed: shorter than any pause between two playbacks, longer than
+the closure of a plosive."""
 LAST_BIT = 2.0**-46
 """Mean square of a 24-bit converter's last bit, -138 dB of full scale: a reference that has less is silent."""
 SUSTAINED = 3
@@ -25,7 +25,7 @@ out of digital silence 9 in 10 vary so within 80 ms, with all below a hundredth 
 NEVER = -sys.maxsize
 """A position long before the first sample."""
 LEAD = SAMPLE_RATE
-"""Samples before now at which an announced utterance is supposed to have begun: it is recognised in its first second."""
+"""Samples before the present one at which an announced utterance is assumed to have begun: its echo is found in its first second."""
 AHEAD = 4096
 """Samples by which an utterance that was heard goes ahead of the microphone, so that the tracker sees to both sides."""
 PATIENCE = 30 * SAMPLE_RATE
@@ -128,7 +128,7 @@ class Playback:
 
     @property
     def end(self) -> int:
-        """Position behind the last sample."""
+        """Position after the last sample."""
         return self.start + self.utterance.size
 
     def read(self, start: int, stop: int) -> Samples:

@@ -253,9 +253,9 @@ def _check_learned(target: Samples, predicted: Samples, fit: Samples, delay: flo
 
 
 def others(target: Samples, predicted: Samples) -> list[tuple[float, float]]:
-    """Stretches (start_s, end_s) where what the whitened prediction (n,) leaves of target (n,) is FIT.others_db above it and the fan.
+    """Stretches (start_s, end_s) in which another source is louder than the robot; gaps of a second or less between them are filled.
 
-    Moments of a second or less between them belong to them.
+    target, predicted: recording and prediction, whitened, (n,). There their difference is FIT.others_db above both the prediction and the fan.
     """
     rest = block_power(target - predicted, BLOCK)
     loud = rest > 10 ** (FIT.others_db / 10) * np.maximum(block_power(predicted, BLOCK), 10.0)
@@ -276,7 +276,7 @@ def _warnings(seconds: float, talk: list[tuple[float, float]]) -> list[str]:
     if talk:
         spans = ", ".join(f"{begin:.1f} to {end:.1f} s" for begin, end in talk)
         told.append(
-            f"a human talks, or something else louder than the robot sounds, at {spans}: what is left there is not the"
-            " robot's"
+            f"a human, or another source that is louder than the robot, is active at {spans}: the residual there is not"
+            " the robot's echo"
         )
     return told

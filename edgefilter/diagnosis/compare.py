@@ -128,7 +128,7 @@ def independence_of(prepared: Straightened, model: EchoModel, score: Score) -> I
 
 
 def _as_played(reference: Samples, model: EchoModel) -> Samples:
-    """The reference (n,) with the model's effects before the loudspeaker and its clock drift: what the loudspeaker is given."""
+    """The reference (n,) with the model's clock drift and its effects ahead of the loudspeaker: the input of the loudspeaker."""
     for effect, values in chain(model.effects):
         if effect.stage in ("source", "time"):
             reference = effect.apply(reference, values, SAMPLE_RATE)

@@ -28,25 +28,25 @@ from edgefilter.types import SAMPLE_RATE, Samples
 ENGINES = ("linear", "ss", "crnn")
 """Those that follow any device without knowing it."""
 LEAST_S, MOST_S = 10.0, 60.0
-"""What a recording has to last, and how much of it is looked at."""
+"""Seconds of the shortest recording that is accepted, and of the longest part of one, from its beginning, that is analysed."""
 SETTLED_S = 5.0
 """The filter has this long with the robot alone before it is measured, and before the human speaks."""
 PAUSE_S = 2.0
 """Between two turns of the human; a turn that is cut shorter by the recording's end does not count."""
 LONG, LEAST_FRAMES = 4 * PERIOD, 4
-"""Samples of the longer of two analysis frames: 2 s, which no room that people talk in outlasts. A recording holds at least
-LEAST_FRAMES frames of a length, or that length is not used."""
+"""Samples of the longer of two analysis frames: 2 s, longer than the reverberation of any room in which people talk. A frame length is used
+only if the recording holds at least LEAST_FRAMES such frames."""
 MOSTLY_NOISE_DB = 2.0
-"""Of the noise under the microphone, dB, over what is not linear, up to which noise is most of that, 63 %: of ten real devices
-one that distorts loudly (yw9vi) has 2.7."""
+"""Level of the nonlinear part of the microphone signal above the background noise, dB, up to which that part counts as mostly noise: at
+2 dB 63 % of it is. Of ten real devices one that distorts loudly (yw9vi) has 2.7 dB."""
 GATED = 1e-9
 """Mean square, -90 dBFS, which no microphone with a converter of 16 bit stays under in 20 ms, unless it was shut."""
 GATED_SHARE = 0.02
 """Share of such moments from which on the microphone is taken for gated: 0.20 on the one device of six (AEC challenge)
 that is, 0 on the others."""
 FULL, CLIPPED_SHARE = 0.999, 1e-4
-"""Of full scale: what reaches it may be cut off; and the share of samples from which on it was. One or two are a file
-that was made as loud as it can be, as two of the same six."""
+"""Level, relative to full scale, from which on a sample may be clipped, and the share of such samples from which on the recording is. One
+or two such samples only show that a file was normalised to full scale, as two of the same six were."""
 FOLLOWS = 0.5
 """Correlation of band levels from which on the microphone holds the robot, however changed: 0.36 where noise covers it,
 0.57 where it is gated, 0.65 and more elsewhere, on the same six."""
@@ -55,7 +55,7 @@ Cause = Literal["nothing", "noise", "gate", "clipping", "other", "change"]
 """What bounds a linear filter: nothing up to ENOUGH_DB, the noise, a microphone that shuts, one that is overdriven, a sound
 that does not follow the reference, or distortion or processing, which one recording cannot tell apart."""
 ENOUGH_DB = 15.0
-"""A linear filter that can remove so much brings a human 10 dB below the robot 5 dB above what is left of it."""
+"""Echo reduction, dB, that is enough: with 15 dB of it a human 10 dB softer than the robot is 5 dB louder than the residual echo."""
 
 
 @dataclass(frozen=True)

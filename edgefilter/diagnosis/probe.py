@@ -36,7 +36,7 @@ MARK_S, GAP_S, END_S = 0.25, 0.15, 0.1
 """Each begins with a noise, by which its lag is found where it is silent itself, and a gap, and ends in silence, so that
 its reverberation is evaluated as well."""
 LINES = 150
-"""Of that sound, drawn from the odd ones, so that products of two or three of them fall between."""
+"""Tones of one sound, drawn from the odd frequency bins, so that most products of two or three tones fall on bins without one."""
 ERROR_TAPS = 64
 """Of the filter that gives a simulated explanation's error its spectrum; it keeps its sign for a HOP (16 ms)."""
 LOOSE = 0.25

@@ -147,7 +147,7 @@ def lasts(name: str) -> bool:
 def with_fitted(
     profile: Profile, prepared: Straightened, names: Sequence[str]
 ) -> tuple[Profile, EchoModel, tuple[str, ...]]:
-    """Fit these effects to the recording: the profile with them, the fitted model, and the names of straightened effects in it."""
+    """Fit these effects to the recording: the profile with them, the fitted model, and which of them the straightening compensates."""
     model, straightened = fit_straight(prepared, names) if names else (prepared.model, ())
     return profile.with_echo(profile.echo.with_effects(names, dict(model.effects))), model, straightened
 

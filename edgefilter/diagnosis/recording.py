@@ -280,9 +280,9 @@ def compare(profile: Profile, recording: Samples, reference: Samples, *, sample_
 
     Notes
     -----
-    Excess is the power of recording minus prediction, whitened by the fan's power spectral density, over the fan's
-    own: 0 dB where nothing is left to explain. The ordinary tolerances of path and fan are taken out, and a constant lag
-    and a drift of the clocks.
+    Excess is the power of recording minus prediction, whitened by the fan's power spectral density, over the power of the fan:
+    0 dB where the fan alone is left. Before that a constant lag, a drift of the clocks and changes of path and fan that are ordinary
+    from day to day are compensated.
 
     Examples
     --------

@@ -129,7 +129,7 @@ class Straightened:
         return replace(self, measurement=replace(self.measurement, fit=fit))
 
     def behind(self, model: EchoModel) -> Straightened:
-        """The same with the fan that a model expects; itself where that is the profile's."""
+        """The same recording, whitened by the fan that a model expects; itself where both models expect the same fan."""
         was, now = (each.expected_noise(self.noise_psd) for each in (self.model, model))
         if np.array_equal(was, now):
             return self

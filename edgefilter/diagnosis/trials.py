@@ -215,7 +215,7 @@ class Workbench:
     def attempt_simpler(self, name: str, model: EchoModel, rigid: bool = False) -> list[Trial]:
         """Try each simpler effect of the family of the effect `name`.
 
-        rigid: leave out those with many free numbers, since either of two such effects can imitate the other.
+        rigid: leave out effects with many free parameters, since any two such effects can imitate each other.
         """
         rich, known = find(name), [find(other) for other in self.absent(model)]
         simpler = [one for one in known if one.family == rich.family and one.complexity < rich.complexity]

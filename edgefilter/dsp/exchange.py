@@ -14,7 +14,7 @@ from edgefilter.types import SAMPLE_RATE, Array, Samples
 REACH = 16
 """Samples of lag that all channels may have in common: what the reference's delay is known to, and more than .3 m."""
 BAND_HZ = (300.0, 7000.0)
-"""Where it is looked: below, microphones of one robot hear the same."""
+"""Band that is compared: below 300 Hz the microphones of one robot, close together, record nearly the same."""
 CLEARER = 0.1
 """By how much more another order of the channels must agree with what is expected: in six simulated offices, microphones 4 cm
 around, the right order agrees to .75 to .92 with a calibration made elsewhere in the room, exchanged ones .15 to .7 less."""

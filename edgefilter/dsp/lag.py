@@ -1,4 +1,4 @@
-"""By how much one signal lags behind another: flat cross-spectra, their highest correlation and its top."""
+"""Lag of one signal behind another: whitened cross-spectra (GCC-PHAT), their highest correlation and its peak between samples."""
 
 from __future__ import annotations
 

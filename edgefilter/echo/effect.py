@@ -148,7 +148,7 @@ class Effect:
 
     @property
     def told(self) -> tuple[Parameter, ...]:
-        """The parameters that say something to people."""
+        """The parameters that a report shows."""
         return tuple(p for p in self.parameters if not p.given)
 
     @property

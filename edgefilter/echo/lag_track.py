@@ -79,11 +79,11 @@ def _coarse(wide: Samples, block: Samples, reach: int) -> tuple[NDArray[np.integ
 
 
 def _fine(near: Samples, block: Samples) -> tuple[Array, Array]:
-    """Rest of the lag (b,) and its standard deviation (b,), samples."""
+    """Lag between samples that is left after the whole lag was taken out, and its standard deviation: (b,) each, samples."""
     window = np.hanning(block.shape[1]).astype(np.float32)
     a, b = scipy.fft.rfft(near * window), scipy.fft.rfft(block * window)
     cross = b * np.conj(a)
-    w = (2 * np.pi / block.shape[1] * np.arange(a.shape[1])).astype(np.float32)  # as precise as the spectra
+    w = (2 * np.pi / block.shape[1] * np.arange(a.shape[1])).astype(np.float32)  # single precision, as the spectra
     lag = np.array([climb(row, w, 0.0, steps=6) for row in cross])
     turned = cross * np.exp(1j * w * lag[:, None])
     power = np.abs(a) ** 2

@@ -1,4 +1,4 @@
-"""What of the effects reaches the running filter, hop by hop, ahead of the path and behind it: folded into it, on windows, or its own way."""
+"""Effects of the profile in the running filter, hop by hop: merged into the path's response, on overlapping windows, or by their own code."""
 
 from __future__ import annotations
 

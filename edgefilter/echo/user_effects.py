@@ -182,7 +182,7 @@ def _run(path: Path) -> ModuleType:
     except SyntaxError as error:
         raise UsageError(f"{path}: line {error.lineno} is not Python ({error.msg})") from None
     except (Exception, SystemExit) as error:
-        raise UsageError(f"{path}: stops with {_told(error)}; it must run on its own before it can be used") from error
+        raise UsageError(f"{path}: stops with {_told(error)}; the file must run without an error by itself") from error
     return module
 
 

@@ -103,9 +103,9 @@ def other_rates(speed: float) -> str:
     """Which usual rates are taken for one another where a sound is played at that speed; nothing where none are.
 
     >>> other_rates(1.09), other_rates(1.05)
-    (': 44.1 kHz seem to be played as 48 kHz, or 22.05 as 24', '')
+    (': sound sampled at 44.1 kHz seems to be played at 48 kHz, or 22.05 at 24', '')
     """
     for given, taken in (((44.1, 22.05), (48, 24)), ((48, 24), (44.1, 22.05))):
         if abs(np.log(speed * given[0] / taken[0])) < STEP:
-            return f": {given[0]:g} kHz seem to be played as {taken[0]:g} kHz, or {given[1]:g} as {taken[1]:g}"
+            return f": sound sampled at {given[0]:g} kHz seems to be played at {taken[0]:g} kHz, or {given[1]:g} at {taken[1]:g}"
     return ""

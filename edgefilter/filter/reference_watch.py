@@ -56,7 +56,7 @@ class ReferenceWatch:
         self._late = self._behind = 0
         self._missing, self._grew, self._another = "", False, False
         self._off_speed = False
-        # of each look: logarithm of the speed found, and its clearness
+        # of each search: logarithm of the playback speed that was found, and how far its peak stands out
         self._seen_speeds: list[tuple[float, float]] = []
         self._speeds: Iterator[tuple[float, float] | None] = iter(())  # of the look that is under way
         self._to_compare, self._looks_left = LENGTH, SPEED_LOOKS
@@ -74,7 +74,7 @@ class ReferenceWatch:
 
     @property
     def suspect(self) -> bool:
-        """Whether what is heard may be the robot, whose reference comes later or not at all, or whose utterance has begun so."""
+        """Whether the sound at the microphone may be the robot although no reference explains it: that comes late or never, or was late so far."""
         return self.without or self._unfound or (self._displaced and not self._idle)
 
     @property
@@ -169,7 +169,7 @@ class ReferenceWatch:
         off, way = 100 * abs(found[0] - 1.0), "faster" if speed > 0.0 else "slower"
         return (
             f"the loudspeaker plays the reference {off:.1f} % {way} than it is given{other_rates(found[0])}; nothing of the"
-            " robot is removed, and nobody is noticed while it talks; give the player the rate that its sound has"
+            " robot is removed, and nobody is noticed while the robot talks; set the player to the sample rate of its sound"
         )
 
     def _same(self, mic: Samples, ref: Samples) -> str | None:

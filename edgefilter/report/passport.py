@@ -40,7 +40,7 @@ CAUSES = {
     "other": "something else sounds that does not follow the reference: somebody talks, or there is another source",
 }
 FIRST = {
-    "noise": "make the room or the fan quieter, or bring loudspeaker or human nearer to the microphone",
+    "noise": "make the room or the fan quieter, or bring the human nearer to the microphone",
     "gate": "switch off the microphone's noise suppression, gain control and echo cancellation, then record again",
     "clipping": "turn the microphone's gain down by 6 to 12 dB, then record again",
     "change": "switch off the microphone's processing; if there is none, turn the loudspeaker down by 6 dB, and record again",
@@ -83,7 +83,9 @@ def advice(found: Passport) -> list[str]:
         told.append("use one sound card for loudspeaker and microphone, if you can: the clocks drift apart")
     linear = found.engines.get("linear")
     if linear and found.removable_db - linear.removed_db > SET_UP.unlearned_db:
-        told.append("calibrate, or let it learn (`run --learn`): more can be removed than the filter did in this time")
+        told.append(
+            "the filter had not yet learned all of the echo path: calibrate, or let it learn for longer (`run --learn`)"
+        )
     return [sentence(one) for one in told or ["nothing needs to be changed"]]
 
 
@@ -99,7 +101,7 @@ def rows(found: Passport) -> list[tuple[str, str, str]]:
         ("drift", f"{found.drift_ppm:+.0f} ppm", "positive: the lag shrinks"),
         ("linear", f"{found.removable_db:.1f} dB", "what a fixed linear filter can take off, by coherence"),
         ("over noise", f"{found.over_noise_db:.1f} dB", "microphone over its noise"),
-        ("changed", f"{found.change_db:.0f} dB", "neither linear nor noise, against what is linear"),
+        ("changed", f"{found.change_db:.0f} dB", "distortion, relative to the linear part of the echo"),
         ("follows", f"{found.follows:.2f}", "correlation of band levels with the reference's"),
         ("gated", f"{100 * found.gated:.0f} %", "of the time the microphone is digitally silent while the robot plays"),
     ]

@@ -63,6 +63,6 @@ def test_two_words_in_a_long_silence_are_not_made_a_clear_speed_by_it() -> None:
 
 
 def test_rates_are_named_for_the_speeds_that_they_make_alone() -> None:
-    assert "44.1 kHz seem to be played as 48 kHz" in other_rates(48 / 44.1)
-    assert "48 kHz seem to be played as 44.1 kHz" in other_rates(44.1 / 48)
+    assert "44.1 kHz seems to be played at 48 kHz" in other_rates(48 / 44.1)
+    assert "48 kHz seems to be played at 44.1 kHz" in other_rates(44.1 / 48)
     assert not any(map(other_rates, (1.0, 1.07, 1.11, 0.94, 0.9)))

@@ -42,7 +42,7 @@ is still there in the median one: 0.00 behind 15 band limits, rattles beside the
 STEEP = 16.0
 """Order of a cut that shows in the power alone."""
 GONE = 0.25
-"""Part of the predicted power above a cut-off that is there at most where the power alone shows the cut."""
+"""Largest share of the predicted power above a cut-off that the recording may hold, where its power alone, not its waveform, shows the low-pass."""
 SMOOTH = 32
 """Frames of a cell, 128 ms."""
 SURE = 4.0
@@ -183,9 +183,9 @@ def _level_db(measurement: Measurement, residual: Samples) -> float:
 
 
 def _dull_above(cutoff_hz: float, measurement: Measurement, voice: Samples, passed: Samples) -> bool:
-    """Whether nothing but what is passed (n,) of a voice (n,), whitened, is heard above the cut-off: a codec puts its noise there.
+    """Whether the recording above the cut-off holds only the low-passed voice: a codec would add its noise there.
 
-    In the median of cells, since knocks are in few of them.
+    voice, passed: the voice before and behind the low-pass, whitened, (n,). The median over time-frequency cells, since few hold knocks.
     """
     above = np.arange(BANDS) * BAND_HZ > 1.1 * cutoff_hz
     heard, due, kept = (
@@ -214,7 +214,7 @@ def low_pass(hz: Array, cutoff: float, order: float, phase: float) -> NDArray[np
 
 
 def measured_response_db(values: Values) -> tuple[Array, Array]:
-    """Frequencies (FFT + 1,) Hz and gain in dB of the filter with its fine taps."""
+    """Frequencies (FFT + 1,) Hz and gain in dB of the fitted low-pass, with its taps."""
     impulse = np.zeros(2 * FFT, np.float32)
     impulse[FFT] = 1.0
     response = np.abs(fft.rfft(Bandlimit().apply(impulse, values, SAMPLE_RATE)))

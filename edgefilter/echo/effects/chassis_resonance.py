@@ -19,8 +19,8 @@ LOWEST_HZ, HIGHEST_HZ, QUALITIES = 60.0, 7000.0, (4.0, 8.0, 16.0, 32.0, 64.0, 12
 SHOWN = 40.0
 """Points of a spectrum within a mode's bandwidth, with which all of the mode shows; the coarse spectrum of 1 Hz has as many from 40 Hz on."""
 MODES, NEXT, LEAST_Q = 2, 0.05, 8.0
-"""Modes that are looked for, the part of what the first explains that a further one must, and the least Q of each: what is
-broader, a fifth of an octave, is within what an equaliser's knots can follow."""
+"""Most resonances that are searched for; least share of the first one's gain that a second one must bring; least Q of each. A
+resonance with a lower Q is broader than a fifth of an octave, and the equaliser's knots can follow it."""
 
 
 class ChassisResonance(Effect):

@@ -42,7 +42,7 @@ class ClockDrift(Shift):
         return n - float(values["offset"]) + 1e-6 * float(values["ppm"]) * n
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """Fit a robust line to the lags of all blocks, take out its drift, and fit again to longer blocks, which the drift would have smeared."""
+        """Fit a robust line to the lags of all blocks, compensate that drift, and fit again to longer blocks, which the drift would have smeared."""
         track, n = measurement.once(lags_of, model), np.arange(measurement.recording.size)
         if track.lag.size < 3:
             return neutral(self)

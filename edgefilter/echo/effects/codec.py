@@ -1,4 +1,4 @@
-"""A codec on the way to the loudspeaker: noise that follows the voice, which the reference does not hold."""
+"""A lossy codec ahead of the loudspeaker: it adds noise that follows the voice and is missing in the reference."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ FOLLOWS = 0.4
 """Correlation, over time in bands, of the residual's level with the voice's: what sounds by itself has none, knocks less than
 0.35."""
 COHERENT = 0.24
-"""Of the residual's power around a cell, what one gain of the voice explains at most: chance is 0.05, codecs are up to 0.22,
-distortions from 0.25 on and all that moves from 0.4 on."""
+"""Largest share of the residual's power around a time-frequency cell that one complex gain of the voice may explain where the residual
+counts as a codec's noise: noise has 0.05, codecs up to 0.22, distortions from 0.25 on, changes over time from 0.4 on."""
 PEAKED = 1.39
 """Standard deviation of the log of the residual's fine structure over frequency, at most: 1.1 of noise, of a loudspeaker's
 distortion, which has the voice's harmonics, 1.45 and more (72 pieces of a real one), of nine codecs in ten below 1.34."""

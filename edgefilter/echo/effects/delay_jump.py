@@ -14,7 +14,7 @@ from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 MOST_JUMPS = 8
 """More are another effect: a lag that moves all the time."""
 FADE = 512
-"""Samples around a stretch between jumps that are shifted with it, and over which what lies further off fades away."""
+"""Samples on either side of a stretch between two jumps that are shifted with it, and fade out away from it."""
 LEAST_JUMP = 0.3
 """Samples; less is no jump, but a block's lag that is not known better."""
 OUTLIER = 25.0
@@ -36,9 +36,7 @@ class DelayJump(Effect):
     name = "delay_jump"
     stage = "source"
     family = "time"
-    run_note = (
-        "the running filter finds jumps by itself, and these were of this recording: adding it changes nothing there"
-    )
+    run_note = "the running filter finds jumps by itself, and those found are of this recording only: adding them to the profile does not change it"
     title = "a delay jump"
     event = True
     followed = True

@@ -78,7 +78,7 @@ class Equaliser(Effect):
         gain_db = numbers(values, "gain_db")
         hz, high, low = knots_hz(gain_db.size), int(np.argmax(gain_db)), int(np.argmin(gain_db))
         return (
-            f"the voice has another colour, smooth over frequency and the same at all levels: {gain_db[high]:+.1f} dB"
+            f"the voice is equalised otherwise than calibrated, smoothly over frequency and alike at all levels: {gain_db[high]:+.1f} dB"
             f" around {hz[high]:.0f} Hz, {gain_db[low]:+.1f} dB around {hz[low]:.0f} Hz"
         )
 

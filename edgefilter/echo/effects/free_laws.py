@@ -113,7 +113,7 @@ class _Ground:
 
 
 class FreeCurve(FreeLaw):
-    """f(x), f straight between its knots, f(0) = 0: an amplifier, a valve, a rectifier, a converter. Beyond them it goes on as it ends."""
+    """y = f(x), f piecewise linear with f(0) = 0: an amplifier, a tube, a rectifier, a converter. Outside its knots it keeps its last slope."""
 
     name = "free_curve"
     stage: ClassVar[Stage] = "source"

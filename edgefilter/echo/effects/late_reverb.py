@@ -12,7 +12,7 @@ from edgefilter.echo.wiener import LONGEST, fit_filter, fit_supported
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
 LEAD = 32
-"""Taps before lag 0 of the filter of a profile of earlier versions."""
+"""Taps before lag 0 of the filter that profiles of earlier versions hold."""
 EXPECTED = 1e-3
 """Expected square of a tap before anything is known of the room, the same at all lags."""
 SLOWER = 1.7
@@ -119,7 +119,7 @@ def fit_path(measurement: Measurement, model: VoiceModel) -> tuple[Array, float,
 
 
 def beside(measurement: Measurement, model: VoiceModel) -> tuple[Samples, Samples, float]:
-    """What a single tap as strong as the response would bring, and what the model leaves, whitened, (n,) each; that tap."""
+    """The echo of a single tap with the energy of the response, and the residual of the model, whitened, (n,) each; that tap."""
     scale = float(np.sqrt(np.sum(np.square(model.response(), dtype=np.float64))))
     tap = measurement.predicted(model.over(np.array([scale], np.float32)))[1]
     return tap, measurement.white_recording - measurement.predicted(model)[1], scale

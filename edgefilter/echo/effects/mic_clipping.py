@@ -75,4 +75,6 @@ class MicClipping(Effect):
         return {"level": found[1], "hardness": found[2]}
 
     def sentence(self, values: Values) -> str:
-        return f"the predicted peaks exceed {first(values, 'level'):.3f} of full scale and the recorded ones do not"
+        return (
+            f"the predicted peaks exceed {first(values, 'level'):.3f} of full scale, which the recorded peaks never do"
+        )

@@ -88,7 +88,7 @@ class MultibandCompression(Effect):
         return {**filters, **_values(found[0]), "delay": delay, "makeup_db": makeup_db}
 
     def sentence(self, values: Values) -> str:
-        """The ratio of each band."""
+        """The compression ratio of each band, for the report."""
         low, high = numbers(values, "crossover_hz", 2)
         ratios = ", ".join(f"{ratio:.1f}" for ratio in numbers(values, "ratio", BANDS))
         return (

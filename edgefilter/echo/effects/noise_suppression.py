@@ -20,7 +20,7 @@ WINDOW = np.sqrt(hann(SIZE))
 FORGETTING, NEIGHBOURS = 0.5, 3
 """Of the local ratio, from frame to frame, and the bins over which it is averaged: what explains most of the suppressors tried."""
 KNOTS_DB = np.arange(-10.0, 31.0, 5.0)
-"""Local ratios of voice to fan; from the last one on everything is let through, up to twice the first one the fan is alone."""
+"""Knots of the gain curve: ratio of voice to fan in a cell, dB. The gain is 1 from the last knot on, that of the fan alone up to -20 dB."""
 LOUD_DB = 15.0
 """Where a suppressor lets nearly all through."""
 TRUST = 0.3

@@ -79,9 +79,9 @@ class PacketLoss(Effect):
         return out
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """The frames without which the error falls most, of all samples: a frame is lost once; their moment to a sample, and their fill.
+        """The frames whose removal from the prediction lowers the error most, without overlap: their times to a sample, and what fills the gaps.
 
-        Neutral where the fan is not heard in the meantime: what the microphone lost, it lost of both.
+        Neutral where the fan is missing in the gaps as well: then the microphone has lost the frames, not the loudspeaker.
         """
         psd, steps = measurement.noise_psd, _steps(measurement, model)
         grid = None if steps is None else _best_grid(steps)

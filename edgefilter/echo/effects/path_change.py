@@ -15,7 +15,7 @@ from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 TAPS, EXPECTED = 3072, 1e-2
 """Of what is added, 0.2 s; and the expected square of each, re the energy of the calibrated response."""
 BLOCK = SAMPLE_RATE // 10
-"""Samples (100 ms) of the steps in which the moment is looked for at first."""
+"""Step of the first, coarse search for the moment of the change, samples (100 ms)."""
 MARGIN = 1.5
 """Seconds at either end in which no change is looked for: it looks like a path that was another all along."""
 

@@ -41,8 +41,8 @@ from edgefilter.types import SAMPLE_RATE, Array, Samples
 TAPS = 320
 """20 ms of ringing after a knock."""
 RIDGE = 1e-2
-"""Regularisation of the fit of a knock's sound, relative to the energy of the knocks: a voice's knocks come so close together that
-neighbouring taps can hardly be told apart."""
+"""Regularisation of the fit of a knock's impulse response, relative to the energy of the pulses that excite it: a voice sets off knocks
+so close together that neighbouring taps are almost collinear."""
 WORTH = 2.5
 """What each tap has to explain, in units of the residual's variance, for the sounds to be real."""
 ANYWHERE = [Trigger(hz, q, NEVER_REACHED, 0.0) for hz, q in product(RESONANCES_HZ, (0.7, 1.0, 1.6))]

@@ -38,15 +38,15 @@ PROMISING = 0.003
 
 
 class SpeakerNonlinearity(Effect):
-    """y = g (x + what a moving coil and an amplifier add whose laws bend), ahead of the linear path.
+    """y = g (x + d), where d is the distortion of the loudspeaker's moving coil and of its amplifier, ahead of the linear path.
 
-    force_factor, stiffness, damping: (2,) a, b of the relative change a s + b s^2 of each with the displacement, s
-    within -1 and 1 (driver_terms); what they add drives the linear membrane like x itself, and the path behind holds
-    that membrane. even, odd: (2,) weights of s x, s^3 x and of s^2 x, s^4 x with s the bent drive (amplifier_terms).
-    resonance_hz: of the membrane. excursion, knee: displacement and drive, full scale, at which s has reached 0.7.
-    level_db only reports: of what is added, but for what is in proportion to the linear voice. gain_db: 20 log10 g, of an
-    amplifier that is overdriven; the volume before it is `playback_gain`'s. What is added never grows faster than x.
-    Valid while it is well below x.
+    force_factor, stiffness, damping: (2,) a, b of the relative change a s + b s^2 of each, where s is the displacement of the
+    membrane, limited to -1..1 (driver_terms). The distorted force moves the same linear membrane as x, whose response is
+    part of the path. even, odd: (2,) weights of s x, s^3 x and of s^2 x, s^4 x, where s is the limited input of the amplifier
+    (amplifier_terms). resonance_hz: of the membrane. excursion, knee: displacement and amplifier input, relative to full scale, at
+    which s is 0.7. level_db: for the report only, level of d without the part proportional to the linear voice. gain_db: 20 log10 g
+    of an overdriven amplifier; a volume ahead of it is `playback_gain`. d never grows faster than x, and the model holds while d is
+    well below x.
     """
 
     name = "speaker_nonlinearity"
@@ -77,7 +77,7 @@ class SpeakerNonlinearity(Effect):
         return out * np.float32(10.0 ** (gain_db / 20.0)) if gain_db else out
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
-        """Least squares in the whitened domain; neutral where no law holds on samples that it was not fitted to."""
+        """Fit by least squares to the whitened recording; neutral values where no law lowers the error on samples kept apart."""
         linear, x = measurement.predicted(model)[1], measurement.reference
         found = fit_laws(
             x,
