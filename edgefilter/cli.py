@@ -232,7 +232,7 @@ def _passport(commands: argparse._SubParsersAction) -> None:
     told = "which engine is tried; repeatable (default: all of them)"
     option("--engine", action="append", choices=("linear", "ss", "crnn"), help=told)
     level = number(-40.0, 20.0, "a level from -40 to 20 dB", closed=True)
-    told = "level of the human whose SI-SDR is predicted, against the robot's (default: %(default)s)"
+    told = "level of the human, dB relative to the robot, for which the SI-SDR is predicted (default: %(default)s)"
     option("--human-db", type=level, default=-10.0, metavar="DB", help=told)
     option("--no-diagnosis", action="store_true", help="do not look for physical effects, which takes longest")
     option("--json", **JSON)

@@ -94,9 +94,9 @@ def speaker(output: Named, speech: Reader) -> SpokenReference:
 
 
 def match(devices: Sequence[Device], wanted: str | int | None, kind: str, default: int) -> Device:
-    """The device that wanted names, as of Named.
+    """Find the device that `wanted` names, by its name, a part of it or its number (`Named`).
 
-    A whole name goes before a part of one, and a part that only a monitor has in it is the last that is taken. Capitals,
+    A whole name is preferred to a part of one; a part that only monitors have in their names is taken last. Capitals,
     dots, dashes and underlines do not matter in a part. kind: 'input' or 'output'; default: index of the system's
     default, -1 for none. Raises UsageError for an unknown or ambiguous name, DeviceError where there is no device of
     this kind at all.

@@ -130,9 +130,9 @@ class Channel:
 class Trial:
     """What one input delivered.
 
-    rate: Hz, at which it was opened. pace: samples per second of this machine's clock, by that rate; 1 is right, good to
-    some 0.1 %. level_db, peak_db: of full scale, -120 for digital silence. overruns: callbacks that were marked.
-    channels: of an array, each of its microphones.
+    rate: Hz, at which it was opened. pace: samples that came per second of this machine's clock, divided by that rate; 1 is right, good
+    to some 0.1 %. level_db, peak_db: of full scale, -120 for digital silence. overruns: callbacks that PortAudio flagged with
+    an overrun. channels: of an array, the result of each microphone.
     """
 
     rate: int

@@ -67,12 +67,13 @@ class Inlet:
 
 
 class Pairing:
-    """Pairs microphone and reference: each sample of the microphone, whose counter is the master, takes one of the reference.
+    """Pairs each sample of the microphone, whose counter is the master clock, with one of the reference.
 
     Both wait here until they are paired. late_is_lost: whether reference that comes after silence has stood in for it is
-    discarded, so that the rest is not shifted; otherwise it is played later. queued: samples of the reference that wait.
-    played: those that were paired; filled, inserted: silence in place of those that did not come in time, or never; skipped:
-    those whose time the microphone has lost; dropped: those that were never played.
+    discarded, so that the rest is not shifted; otherwise it is used later. Counters, in samples: queued: of the reference, waiting;
+    played: of the reference, paired; filled: silence in place of reference that had not come in time; inserted: silence in place of
+    reference that will never come; skipped: of the reference, left out because the microphone lost as many; dropped: of the
+    reference, removed because it will not be played.
     """
 
     def __init__(self, late_is_lost: bool = True) -> None:

@@ -1,7 +1,7 @@
-"""A speaker for the robot and a microphone for everybody else, on PulseAudio or PipeWire's stand-in for it.
+"""A virtual speaker for the robot and a virtual microphone for all other programs, on PulseAudio or pipewire-pulse.
 
-As module-echo-cancel has them: what is played into the speaker goes to the default output and is the reference,
-what `edgefilter run` writes can be listened to as a microphone.
+As with module-echo-cancel, sound that is played to the speaker goes on to the default output and is the reference; the microphone
+carries the output of `edgefilter run`.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ WRITTEN = (
 PROFILES = ("output", "save_profile", "learn", "apply")
 """Those of them that name a profile: wherever 'output' is a file that is written in the end, it is one."""
 CASES = ("one", "two")
-"""The robots of `demo --hidden`, folders of demo_data/hidden: one thing has happened to the first, two to the second."""
+"""The robots of `demo --hidden`, folders of demo_data/hidden: the first has one fault that is not told, the second two."""
 HIDDEN_FILES = (
     *("robot.npz", "mic.wav", "tts.wav", "talk.wav", "talk_tts.wav", "better.npz"),
     *("human_before.wav", "human_after.wav", "report.html", "before_after.png"),
@@ -88,7 +88,9 @@ def check_outputs(args: argparse.Namespace) -> None:
     """
     for option, path in _given(args, *READ, *WRITTEN, *IN_FOLDERS):
         if not path or "\0" in path:
-            raise UsageError(f"{flag(option)} is {path!r}, which names no file: give one or leave the option out")
+            raise UsageError(
+                f"{flag(option)} is {path!r}, which is not the name of a file: give one or leave the option out"
+            )
     read, written = list(_read(args)), list(_written(args))
     for number, output in enumerate(written):
         if output.path == "-" and output.stream is None:

@@ -19,7 +19,7 @@ CLEARER = 0.1
 """By how much more another order of the channels must agree with what is expected: in six simulated offices, microphones 4 cm
 around, the right order agrees to .75 to .92 with a calibration made elsewhere in the room, exchanged ones .15 to .7 less."""
 EQUAL = 1e-3
-"""Part of its power by which a channel may differ from one that it is a copy of: -30 dB, rounding and a converter."""
+"""Power of the difference of two channels, over that of one, up to which they are copies: -30 dB allows for rounding and for a converter."""
 ALIKE = 0.3
 """Least agreement, of 1, with which the best order says anything: the robot is heard at all."""
 
@@ -74,7 +74,7 @@ def _best_order(alike: Array) -> tuple[float, list[int]]:
 
 @lru_cache(maxsize=4)
 def _lags(n: int) -> tuple[slice, Array]:
-    """The bins that count, and exp(j omega lag) (bins, 2 REACH + 1) of them, for n samples."""
+    """The bins of BAND_HZ of an FFT of n samples, and their exp(j omega lag) for lags of -REACH to REACH samples, (bins, 2 REACH + 1)."""
     band = slice(*(round(hz * n / SAMPLE_RATE) for hz in BAND_HZ))
     omega = 2 * np.pi * np.arange(band.start, band.stop) / n
     return band, np.exp(1j * omega[:, None] * np.arange(-REACH, REACH + 1)).astype(np.complex64)

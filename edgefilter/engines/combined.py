@@ -109,7 +109,7 @@ def fallbacks(best: Engine, profile: Profile | None) -> list[Engine]:
     found, names = [best], engines.CANDIDATES
     for name in names[names.index(best.name) + 1 :] if best.name in names else ():
         try:
-            engine = cast(Engine, engines.create(name, profile, best.stft))  # no candidate needs the whole recording
+            engine = cast(Engine, engines.create(name, profile, best.stft))  # a streaming one, as all candidates are
         except EdgefilterError:
             continue
         if _take_turns(engine, best):

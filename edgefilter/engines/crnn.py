@@ -74,9 +74,9 @@ class Crnn:
     """Runs an exported EdgeCrnn (export/network.py), one frame at a time.
 
     model: an ONNX file made by export/onnx_export.py; without one the file that the environment variable
-    EDGEFILTER_CRNN names, else the package's own, whose recurrent layer has int8 weights: a hop finds them cold, and
-    reads a quarter of the bytes. The file says which STFT it was trained for. profile: the robot; calibrated, not
-    learned, it gives `ss` a share of the answer. Raises ModelError for a file that is not such a model.
+    EDGEFILTER_CRNN names, else the package's own, whose recurrent layer has int8 weights: a hop reads them from
+    memory, a quarter of the bytes. The file says which STFT it was trained for. profile: the robot; where it is calibrated,
+    not learned, a share of the output is that of `ss`. Raises ModelError for a file that is not such a model.
     """
 
     name: ClassVar[str] = "crnn"
@@ -177,9 +177,9 @@ class Places:
 
 
 def _with_what_is_sure(sounds: Spectrum, frame: Frame) -> Spectrum:
-    """The sounds (sounds, bins), each bin raised to what spectral subtraction (Boll 1979) leaves of the error.
+    """The sounds (sounds, bins), no bin softer than spectral subtraction (Boll 1979) leaves it of the error.
 
-    SURE times the expected powers of noise and residual echo are subtracted.
+    SURE times the expected powers of noise and residual echo are subtracted, so what remains is surely neither.
     """
     error = frame.error
     power = fourier.power(error)

@@ -147,7 +147,7 @@ def open_model(path: Path, kind: str, version: int) -> Model:
 
 
 def expect_slots(model: Model, inputs: Mapping[str, tuple], outputs: Mapping[str, tuple]) -> None:
-    """Refuse a model whose inputs or outputs have other names, or shapes that cannot be these; "any" is a free size."""
+    """Refuse a model with other names of inputs or outputs than these, or with incompatible shapes; "any" stands for every size."""
     for word, slots, wanted in (
         ("inputs", model.session.get_inputs(), inputs),
         ("outputs", model.session.get_outputs(), outputs),

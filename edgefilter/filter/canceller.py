@@ -36,7 +36,7 @@ hop says, before the echo has arrived or while the voice only begins, may be wro
 DECAY_RT60_S = 1.0
 """Decay of the covariance prior behind the direct sound, seconds for 60 dB."""
 LATE_VARIANCE = 0.04
-"""Power of the unknown room's decay at the direct sound, relative to the calibrated path."""
+"""Prior variance of an unknown room's decay, extrapolated to the direct sound, relative to the power of the calibrated path."""
 DISPLACEMENT_SCALE = 0.7
 """Displacement, relative to the loudest rms that the reference has held so far, at which the products have its size."""
 FURTHEST = 10.0
@@ -123,17 +123,17 @@ class Canceller:
     """Predicts the echo of one hop from that hop's reference and corrects itself by what the prediction left.
 
     Overlap-save blocks of 2 * hop; partition p covers taps p * hop ... (p + 1) * hop - 1. Microphone and reference are
-    heard through a low shelf (SHELF_HZ), and the echo is raised again. Diagonal state-space model of
+    heard through a low shelf (SHELF_HZ), which is undone in the echo. Diagonal state-space model of
     Enzner & Vary (2006), "Frequency-domain adaptive Kalman filter for acoustic echo control", eq. (27)-(34),
     partitioned as in Kuech, Mabande & Enzner (2014), "State-space architecture of the partitioned-block-based acoustic
-    echo controller". Beside the reference x it hears d x and d^2 x, d being the membrane's displacement (x low-passed):
-    what force factor and stiffness that depend on the displacement add to a moving-coil loudspeaker (Klippel 2006,
+    echo controller". Its inputs are the reference x and the products d x and d^2 x, d being the membrane's displacement (x
+    low-passed): force factor and stiffness of a moving-coil loudspeaker depend on the displacement (Klippel 2006,
     "Loudspeaker nonlinearities"). Their paths are PRODUCT_PARTITIONS long and start at zero. adaptation: WARM where
     impulse_response is given, COLD where not, unless said otherwise. impulse_response (n,) float32 starts the filter;
     longer than taps it is cut, without it the start is cold. microphones: of an array, None for a single one: signals are
-    then (microphones, hop), the impulse response (microphones, n), and all that is said of a path holds of each; the volume,
-    and whether the echo is there at all, is told in one microphone (tell_by) for all of them. behind(echo, mic) (hop,): what
-    the microphone makes of the echo that the path brings, None for nothing. Raises SignalError where hop or taps are not
+    then (microphones, hop), the impulse response (microphones, n), and each microphone has its own path; the volume, and whether
+    there is an echo, is decided in one microphone (tell_by) for all. behind(echo, mic) (hop,): the microphone's own processing of
+    the echo; None where it has none. Raises SignalError where hop or taps are not
     positive or the impulse response is not finite.
     """
 
@@ -266,7 +266,7 @@ class Canceller:
         return CancellerOutput(echo, mic - echo, misalignment * self._raised.power, innovation)
 
     def _behind_path(self, path_echo: Samples, mic: Samples) -> Samples:
-        """What the microphone makes of the echo that the path brings (..., hop), both through the shelf."""
+        """The predicted echo (..., hop) after the processing of the microphone (`behind`); it and mic have passed the low shelf."""
         if not self.behind:
             return path_echo
         shelves = self._shelves
@@ -290,7 +290,7 @@ class Canceller:
         return x if self.microphones is None else x[self._teller]
 
     def _push(self, reference: Samples) -> None:
-        """Take the reference's next hop into the spectra and powers (partitions, bins), the newest first in each channel."""
+        """Shift the reference's next hop into the spectra and powers (partitions, bins), the newest first among those of x, d x and d^2 x each."""
         self._recent[:, : self.hop] = self._recent[:, self.hop :]
         self._played[0] = reference
         if self.adaptation.products:

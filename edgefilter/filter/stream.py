@@ -54,11 +54,11 @@ SOFTER_HOPS = 3
 class Stream:
     """Runs one engine over blocks of any length; whatever the partition, the output is bit-identical.
 
-    `EgoFilter` says what process, flush, robot_removed and the properties give. With an engine that waits for the end,
-    process returns nothing and flush everything. stepping: told the compute time of every hop; what it answers becomes an
-    event. barge_in, learner, on_barge_in, keep_channels, on_suspicion, output: as of `EgoFilter`. other: (n,), the sound that
-    was not asked for, of the samples that process or flush returned last. queued: samples that the loudspeaker has been handed and
-    not played yet: they cannot be lowered any more.
+    process, flush, robot_removed and the properties are those of `EgoFilter`. With an engine that waits for the end,
+    process returns nothing and flush everything. stepping: takes the compute time of every hop and may choose another engine, which becomes an
+    event. barge_in, learner, on_barge_in, keep_channels, on_suspicion, output: as of `EgoFilter`. other: (n,), the one of the two
+    sounds (to recognise, to listen to) that process or flush did not return, of the same samples. queued: samples that the
+    loudspeaker has been given and not played yet: they cannot be lowered any more.
     """
 
     def __init__(
@@ -246,7 +246,7 @@ class Stream:
         return 10.0 ** (-self.barge_in.settings.ask_db / 20.0) if self.barge_in.asking else 1.0
 
     def _softer_after(self, frame: Frame, aligned: Aligned | None) -> int:
-        """Hops after which a voice that is lowered now would be heard, 0 where nobody lowers it or nothing of it is heard."""
+        """Hops until a robot's voice that is lowered now arrives lower at the microphone; 0 where it cannot be lowered or is not heard."""
         if not self.barge_in.settings.ask_db or frame.idle or aligned is None or not math.isfinite(aligned.delay):
             return 0
         return SOFTER_HOPS + math.ceil((self.queued + max(aligned.delay, 0.0)) / self.engine.stft.hop)

@@ -40,7 +40,7 @@ class Turns:
         self._count = self._begin = 0
 
     def step(self, answer: Spectrum, error: Spectrum, errors: Spectrum | None) -> None:
-        """Keep a frame: the engine's answer and the error (bins,) that it was given, and the errors (microphones, bins)."""
+        """Keep a frame: the engine's output and the error it was given, (bins,); errors of all microphones, (microphones, bins), of an array."""
         at = self._count % self._room
         if at >= len(self._gains):
             self._grow()

@@ -17,8 +17,8 @@ MEMORY = 0.8
 EXCESS = 1.5
 """Ratio of the error's power to that of the microphone, or to the error with another volume, above which the gain is wrong."""
 PATIENCE_S = 0.5
-"""Seconds in which a suspected volume must be confirmed, and for which none is suspected afterwards; seconds after which
-an echo that is too loud is put down to another path."""
+"""Seconds within which a suspected change of volume must be confirmed, and after it for as long none is suspected. Also: seconds for which an
+echo must be louder than predicted until the path counts as changed."""
 COHERENCE = 0.3
 """Least squared correlation coefficient of echo and microphone at which a volume is suspected: less may be chance."""
 NOTICED = 1e-3
@@ -26,8 +26,8 @@ NOTICED = 1e-3
 AUDIBLE, FORGET_S = 0.01, 10.0
 """The robot is audible where its power is within 20 dB of its recent peak, which fades by 10 dB in FORGET_S seconds."""
 MOST = 10.0
-"""Largest factor, 20 dB, by which the volume is followed from where it was at first, up or down; and the factor by which
-a path that began unknown must have lowered the microphone's power before its volume means anything."""
+"""Largest factor of amplitude, 20 dB, by which the volume is followed up or down from its first value. Also: factor by which a path that began
+unknown must have lowered the microphone's power, 10 dB, before its volume is trusted."""
 PRE_EMPHASIS = 0.95
 """First-order pre-emphasis before a volume is told and paths are compared: noise and rumble below the voice weigh less.
 Without it two of 63 recordings, simulated and real, lose 0.8 dB in the volume, and none wins."""

@@ -356,7 +356,7 @@ class Duplex:
 
 
 class Pace:
-    """Whether sound comes as fast as its rate says: wrong ones are off by a few known factors, a busy machine by any.
+    """Tells a wrong sample rate, whose sound comes too fast or slow by one of a few factors, from a busy machine, where it may be any.
 
     >>> now = iter(range(100))
     >>> pace = Pace(lambda: float(next(now)))

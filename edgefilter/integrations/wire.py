@@ -154,7 +154,7 @@ class _Order:
         self.newest = self.bytes = 0
 
     def push(self, number: int, at: int, sound: bytes) -> Iterator[tuple[int, bytes, bool]]:
-        """Take a message; of all whose turn it is now the counter, the sound, and whether messages were lost before it."""
+        """Take a message and yield all that are now in order: sample counter, sound, and whether messages before it were lost."""
         if self._next is None:
             self._next = number
         ahead = (number - self._next + 32768) % 65536 - 32768

@@ -209,7 +209,9 @@ class _Command(MicProcessAsyncClient):
         assert process is not None
         with contextlib.suppress(ProcessLookupError):
             process.kill()
-        await process.communicate()  # wait() alone would wait for ever for the end of a pipe that is full
+        await (
+            process.communicate()
+        )  # a process whose output pipe is full never ends, so wait() alone would block for ever
 
 
 class _BoundedReader:
@@ -359,7 +361,7 @@ class _Speaker(_Client):
 
 
 class _Recogniser(_Client):
-    """A client that asks for speech to text: instead of the sound that it sends, the recogniser gets the human's finished turn, filtered."""
+    """A client that asks for speech to text: in place of its own sound the recogniser gets the human's last turn, filtered."""
 
     def __init__(self, service: EgoService, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         super().__init__(service, reader, writer)

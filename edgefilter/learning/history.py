@@ -14,7 +14,7 @@ from edgefilter.types import SAMPLE_RATE, Samples
 MINUTE = 60.0
 """Seconds that are kept."""
 RECENT_S = 15.0
-"""The newest of them, s: enough to fit a loudspeaker and a room to, and all of it from where the robot stands now."""
+"""Seconds of the newest sound among them: enough to fit a loudspeaker and a room to, and as a rule all from where the robot stands now."""
 
 
 class HopHistory:

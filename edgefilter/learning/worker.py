@@ -18,7 +18,10 @@ from edgefilter.learning.path_learner import PathLearner
 
 def main() -> None:
     """Run until the other side closes standard input."""
-    for number in (signal.SIGINT, signal.SIGTERM):  # meant for the filter, which then closes standard input
+    for number in (
+        signal.SIGINT,
+        signal.SIGTERM,
+    ):  # it is meant for the filter; when that ends, standard input is at its end and so are we
         signal.signal(number, signal.SIG_IGN)
     if hasattr(os, "nice"):
         os.nice(10)

@@ -31,7 +31,7 @@ MAX_TAPS = 4 * SAMPLE_RATE
 """Samples, 4 s: longer than the reverberation of any room that a robot talks in, and than the lag of any player."""
 LEARNED = "what the running filter learned"
 PROVISIONAL = "made from the recording itself: what is stationary and linear is taken for the robot"
-"""Sources of profiles that no calibration made: their paths are known as well as speech can teach them, not as a sweep can."""
+"""Sources of profiles that were made without a calibration: their paths are only as accurate as speech allows, less than by a sweep."""
 
 _ARRAYS = ("response", "noise_psd", "band_hz", "band_snr_db", "distortion_db")
 

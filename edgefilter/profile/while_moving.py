@@ -52,7 +52,7 @@ class WhileMoving(ProfilePart):
 
     @classmethod
     def learned(cls, with_voice: Samples, stft: StftConfig, moments: float, seconds: float) -> WhileMoving:
-        """Of the power that `with_voice` returns for stft, (bins,), and how often the robot was taken for a human in so many seconds."""
+        """Make it of the noise that moves with the voice, a power (bins,) for stft, and of how often the robot was taken for a human in `seconds`."""
         density = np.interp(frequencies(GRID_BINS), stft.frequencies, with_voice) / stft.frequencies[1]
         return cls(density.astype(np.float32), moments, seconds)
 

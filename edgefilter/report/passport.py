@@ -78,7 +78,9 @@ def advice(found: Passport) -> list[str]:
             f"use a loopback that loses nothing, or larger buffers: {found.lost_ms:.0f} ms are missing in the reference"
         )
     elif found.lag_spread_ms > SET_UP.lag_spread_ms:
-        told.append("use larger buffers, or one program for playing and recording: the lag jumps")
+        told.append(
+            "the delay of the robot at the microphone jumps: use larger buffers, or play and record in one program"
+        )
     if abs(found.drift_ppm) > SET_UP.drift_ppm:
         told.append("use one sound card for loudspeaker and microphone, if you can: the clocks drift apart")
     linear = found.engines.get("linear")

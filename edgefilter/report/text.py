@@ -26,7 +26,7 @@ smaller dependences, which nobody would correct."""
 LINES = 10
 """Of a comparison or a diagnosis as the command prints it without --verbose: with the command typed before it half of a terminal."""
 MORE = "more        --verbose: all figures; --report PAGE.html: pictures and sound"
-IRREDUCIBLE = "noise, of which no waveform can be predicted"
+IRREDUCIBLE = "noise, whose waveform nothing predicts"
 CALIBRATE = "edgefilter calibrate --live --output robot.npz"
 HEADS = ("rank", "effect", "alone, dB", "added, dB", "verdict")
 

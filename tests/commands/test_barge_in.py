@@ -135,7 +135,7 @@ def test_an_engine_that_tells_no_speech_is_said_once_and_one_that_does_is_not():
         (["--input", "mic", "--speaker", "x"], "--speaker concerns"),
         (["--input", "-", "--play", "x.wav"], "found --input -"),
         (["--input", "mic", "--reference", "monitor", "--play", "x.wav"], "found --reference monitor"),
-        (["--input", "mic", "--play", ""], "names no file"),
+        (["--input", "mic", "--play", ""], "is not the name of a file"),
     ],
 )
 def test_what_cannot_be_meant_is_one_line(words, expected, tmp_path, monkeypatch, capsys):

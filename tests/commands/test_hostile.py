@@ -43,7 +43,7 @@ RUN = ("run", "--input", "mic.wav", "--engine", "bypass", "--output", "out.wav")
     "option", ["--json", "--profile", "--reference", "--model", "--record", "--save-profile", "--effects"]
 )
 def test_an_empty_name_as_an_unset_shell_variable_gives_is_not_taken_for_no_option(folder, option):
-    one_line(here(*RUN, option, ""), 2, option, "names no file")
+    one_line(here(*RUN, option, ""), 2, option, "is not the name of a file")
     assert not (folder / "out.wav").exists()
 
 

@@ -80,7 +80,7 @@ def test_the_terminal_says_verdict_budget_parameters_and_what_is_left():
         "rt60_s = 0.610 dB (0.510 to 0.710)",
         "9.0 to 1.0 dB, 90 %",
         "Evidence for my_own.",
-        " dB over the fan: noise, of which no waveform can be predicted. A hum at 50 Hz.",
+        " dB over the fan: noise, whose waveform nothing predicts. A hum at 50 Hz.",
     ):
         assert part in told, part
     bars = [len(line) - len(line.rstrip("#")) for line in lines if line.startswith("  with ")]
