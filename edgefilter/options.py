@@ -26,7 +26,7 @@ def whole(least: int, most: int, expected: str) -> Callable[[str], int]:
 
 
 def number(least: float, most: float, expected: str, closed: bool = False) -> Callable[[str], float]:
-    """The same for any number between them, closed: or one of them."""
+    """Argument type for a number between least and most; closed: the limits themselves are allowed too."""
 
     def read(text: str) -> float:
         try:

@@ -371,7 +371,7 @@ def _fitted(measurement: Measurement, model: EchoModel, effects: Sequence[str]) 
 
 
 def _halves(prepared: Straightened) -> tuple[Straightened, Straightened]:
-    """Fit to one half of the cells and test on the other, then the other way round."""
+    """The recording, and the same with what is fitted and what is held out exchanged, for a cross-validation by halves."""
     return prepared, prepared.fitted_to(prepared.held_out)
 
 

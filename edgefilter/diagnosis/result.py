@@ -116,7 +116,7 @@ class Known:
 
 @dataclass(frozen=True)
 class Precision:
-    """How well the found numbers are known, and what they share of it: (label, label, correlation), the closest first."""
+    """Uncertainty of the fitted parameters, and the correlations of their errors: (label, label, correlation), the strongest first."""
 
     numbers: tuple[Known, ...] = ()
     correlations: tuple[tuple[str, str, float], ...] = ()

@@ -1,4 +1,4 @@
-"""Engines made of engines: several that take turns with a crossfade, and one whose speech another one judges."""
+"""Engines made of engines: one that switches between several with a crossfade, one whose speech probability another engine gives."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class Fallback:
 
 
 def fallbacks(best: Engine, profile: Profile | None) -> list[Engine]:
-    """The best candidate and the cheaper ones that can take turns with it: those that can be made with its STFT and front."""
+    """The best candidate and the cheaper ones that can replace it on a slow machine: those with the same STFT and front end."""
     found, names = [best], engines.CANDIDATES
     for name in names[names.index(best.name) + 1 :] if best.name in names else ():
         try:

@@ -153,7 +153,7 @@ class EchoCanceller:
             each.queued_s = seconds
 
     def events(self) -> list[Event]:
-        """What happened at the first microphone since the last call, as of `EgoFilter`; its samples are those at 16 kHz."""
+        """Events of the first microphone since the last call, as of `EgoFilter`; their positions count samples at 16 kHz."""
         return self._filters[0].events()
 
     def process(self, mic: Sound, ref: Sound) -> Sound:

@@ -515,7 +515,7 @@ def _levels(x: Samples, settings: Sequence[Times], before_db: float = FLOOR_DB) 
 
 
 def _solved(matrix: Array, right: Array, bends: Array) -> tuple[Array, float]:
-    """Least-squares weights (k,), their bends (m, k) held small, and the energy that they explain."""
+    """Regularised least squares: weights (k,) with a penalty on `bends @ weights`, bends (m, k), and the energy that they explain."""
     held = (BEND * bends.T @ bends + 1e-6 * BEND * np.eye(right.size)) * (np.trace(matrix) / right.size + 1e-30)
     found = np.linalg.solve(matrix + held, right)
     return found, float(2.0 * found @ right - found @ matrix @ found)
