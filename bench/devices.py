@@ -267,7 +267,7 @@ def barge_in(rows: Sequence[dict], here: Sequence[System], tuned_on: set[str]) -
 
 
 def as_recorded(rows: Sequence[dict], here: Sequence[System]) -> dict:
-    """Pairs, and robots alone of one recording: AECMOS for echo and human; SI-SDR against the microphone for a human alone."""
+    """Clips as recorded, nothing mixed in: AECMOS for echo and human, SI-SDR re the microphone of a human alone."""
     pairs = [row for row in rows if row["set"] in ("pairs", "alone") and row.get("echo_mos") is not None]
     here = [one for one in here if one.kind != "bound" and not one.name.endswith(systems.TRUE_LAG)]
     cells = []

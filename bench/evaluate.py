@@ -270,7 +270,7 @@ def slices(rows: Sequence[dict], here: Sequence[System]) -> list[dict]:
 
 
 def worst(rows: Sequence[dict], here: Sequence[System]) -> list[dict]:
-    """The clips on which our best row does worst, worst first; equal ones by SI-SDR."""
+    """The clips on which our best system has the worst figure (words, or SI-SDR without a recogniser), worst first."""
     key, _, _, worse = metric(rows)
     candidates = ("crnn", "crnn-uncalibrated", *(one.name for one in here))
     mine = next(filter(None, (of(rows, name) for name in candidates)), [])

@@ -220,7 +220,7 @@ def per_hour(count: int, hours: float) -> dict:
 
 
 def replay(probability: Sequence[float | None], hop: int, threshold: float) -> list[Event]:
-    """The events that the package would give at another threshold, one value a hop of so many samples."""
+    """The events that the package would give at this threshold, of one probability a hop (samples); None where nothing judged."""
     usual = BargeInSettings()
     rule = BargeIn(hop / SAMPLE_RATE, replace(usual, threshold=threshold, release=min(usual.release, threshold)))
     found = ((index * hop, rule.note(value)) for index, value in enumerate(probability, start=1))
@@ -350,7 +350,7 @@ TALKS_DB = 30.0
 
 
 class Quantity(NamedTuple):
-    """By what results are cut: its name in a clip's facts, as a heading, and its digits."""
+    """A quantity by which results are split into bins: its key among a clip's facts, its heading, and its digits."""
 
     key: str
     title: str

@@ -27,7 +27,7 @@ from edgefilter.profile.data import Profile
 
 PACKAGE = Path(edgefilter.__file__).parent
 DIAGNOSIS = "diagnosis"
-"""Stands among the systems for the names and values that the diagnosis finds."""
+"""In the place of a system's name: the names and values that the diagnosis finds."""
 TIMED, RUNNING = "timed code", ("alignment", "dsp", "engines", "filter")
 """Stands among the systems for the code of the running path, in these folders, where it is timed: slower code may give the same sound."""
 LEARNING = "-learning"
@@ -77,7 +77,7 @@ def models_of(names: Iterable[str]) -> dict[str, Path]:
 
 
 def command(data: Mapping[str, Sequence[Path]], models: Mapping[str, Path]) -> str:
-    """The command line that runs now: data and models by what they are, other paths by their last part."""
+    """The present command line without the paths of this machine: data and models by their names here, other paths by their last part."""
     known = {path.resolve(): f"{what}/{path.resolve().name}" for what, paths in data.items() for path in paths}
     known |= {path.resolve(): name for name, path in models.items()}
 

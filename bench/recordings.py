@@ -192,7 +192,7 @@ class Recording:
         mic, ref = read(self.mic_path, several=True), read(self.ref_path)
         if not mic.size or abs(mic.size - ref.size) > LENGTHS_S * SAMPLE_RATE:
             found = f"{mic.size / SAMPLE_RATE:.2f} s of microphone and {ref.size / SAMPLE_RATE:.2f} s of loopback"
-            wanted = f"within {LENGTHS_S:.0f} s as much: take the files of one recording"
+            wanted = f"lengths within {LENGTHS_S:.0f} s of each other: take the files of one recording"
             raise UsageError(f"{self.name}: {found}, expected {wanted}")
         taken = slice(*self.span) if self.span else slice(None)
         return Signals(mic[taken], np.pad(ref, (0, max(mic.size - ref.size, 0)))[: mic.size][taken])
@@ -294,7 +294,7 @@ class Cells:
 
 
 def lay(recordings: Sequence[Recording], speech: Path, cells: Cells, cases: int, seed: int) -> list[Laid]:
-    """So many cases of a human on the recordings in turn; case i of a seed has the same human and place in all cells."""
+    """Mix humans into the recordings in turn, `cases` in all; case i of a seed has the same human and onset in every cell."""
     spoken, rng = transcripts(speech), np.random.default_rng(seed)
     order = rng.permutation(len(spoken))
     laid = []

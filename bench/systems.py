@@ -41,7 +41,7 @@ TRUE_LAG = "-true-lag"
 PEERS = {"speexdsp": "SpeexDSP", "speexdsp-suppressed": "SpeexDSP with its suppressor", "aec3": "WebRTC AEC3",
          "echoff": "echoff", "voiceclean": "voiceclean"}  # fmt: skip
 SPECIAL = ("detector", "listen", "asked")
-"""Kinds of rows that are taken only where they are named."""
+"""Kinds of systems that run only where they are named."""
 HEARD = ("unfiltered", "speexdsp-suppressed", "aec3", "crnn-uncalibrated")
 """Rows behind which a detector of speech can stand, as "ROW+DETECTOR" or "ROW+DETECTOR-held"."""
 ABSENT = {

@@ -139,7 +139,7 @@ def tables(found: Mapping[str, Sequence[Row]]) -> list[dict]:
 
 
 def summary(rows: Sequence[Row]) -> list[list]:
-    """A line for all that was named, and one for what was kept."""
+    """Two lines of the table: for a profile with every effect that was named, and with those that `diagnose` kept."""
     tested = [row for row in rows if row.named_db is not None and row.kept_db is not None]
     lines = []
     for way in ("named", "kept"):

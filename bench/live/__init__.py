@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--microphone",
         choices=tuple(MICROPHONES),
-        help="barge-in: how the microphone processes its sound, or what it hears besides (bench/simulate/microphones.py)",
+        help="barge-in: processing of the microphone, or a sound that it hears besides voices (bench/simulate/microphones.py)",
     )
     add("--sound", type=Path, metavar="DIR", help="barge-in: folder for WAV files of what robots play and hear")
     add("--real", type=Path, metavar="DIR", help="barge-in: recordings of a real loudspeaker alone")

@@ -194,7 +194,7 @@ def drifts(found: dict) -> list[str]:
         if second - first > LEARNER_GROWTH_MB:
             troubles.append(f"the learner's memory grew by {second - first:.1f} MB")
     if "bypass_ms" in settled[0]:
-        # the mean, since a slice of silence costs two thirds of another; a bypassed block always costs the same
+        # means, since a slice without speech takes two thirds of the time of one with speech; a bypassed block always takes the same
         took, bypass = ([[one[key] for one in half] for half in _halves(settled)] for key in ("p50_ms", "bypass_ms"))
         first, second = (float(np.mean(ours) / np.median(its)) for ours, its in zip(took, bypass))
         found["slower"] = second / first

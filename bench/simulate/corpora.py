@@ -278,7 +278,7 @@ def robot(render: Renderer, output: Path) -> Sums:
 
 
 def synthesizers(output: Path) -> Sums:
-    """Write DATA/synthesizers: the sentences of all sets, each READ times, by SYNTHESIZED in turn."""
+    """Write DATA/synthesizers: the sentences of all sets, each spoken READ times, by one after the other of SYNTHESIZED; checksums."""
     texts, voices = dict.fromkeys(sentence.text for sentence in read_sentences()), cycle(SYNTHESIZED)
     each = ((number, text) for number, text in enumerate(texts) for _ in range(READ))
     sentences = [Sentence("synthesizers", next(voices), number, text) for number, text in each]

@@ -30,7 +30,7 @@ Disturbance = Callable[[Rng, Scene, Chain, str, Person], tuple[Chain, dict]]
 
 ENR_DB = {"clear": 12.0, "moderate": 5.0, "near": -1.0}
 RANGES = {
-    # RT60 in s, calibrated at 0.18-0.32
+    # RT60 in s; the calibration was made in rooms of 0.18-0.32 s
     "late_reverb": {"clear": (0.60, 0.85), "moderate": (0.45, 0.60), "near": (0.36, 0.45)},
     "bandlimit": {"clear": (2500, 3800), "moderate": (3800, 5000), "near": (5500, 6600)},  # Hz
     "clock_drift": {"clear": (100, 300), "moderate": (30, 100), "near": (10, 30)},  # ppm
@@ -366,7 +366,7 @@ CODECS = {
 
 
 CUT_HZ = 6500.0
-"""Where a codec passes little above it, a band limit is as right a name."""
+"""Where a codec passes little above this frequency, "bandlimit" counts as a right name as well."""
 
 
 def _with_sound(scene: Scene, chain: Chain, sound: Array, strength: str) -> Chain:

@@ -50,7 +50,7 @@ class Place:
 
 
 def draw_place(rng: Rng, rt60_s: float, geometry: Array | None = None, size: Array | None = None) -> Place:
-    """A room of this reverberation time (Sabine's formula, +-25 %).
+    """A room of about this reverberation time: by Sabine's formula, which is off by up to 25 %.
 
     geometry (3,): from microphone to loudspeaker in m, else drawn, 0.1-0.3 m. size (3,) in m, else drawn.
     """

@@ -148,7 +148,7 @@ def reliability(chosen_ones: Sequence[Listened], centre: float, slope: float) ->
 
 
 def curve(chosen_ones: Sequence[Listened], centre: float, slope: float) -> list[dict]:
-    """For each threshold: false starts an hour on robots alone, and laid or conversing humans noticed in time."""
+    """For each threshold: false starts an hour of robots alone, and the share of humans, mixed in or in conversations, noticed in time."""
     points = []
     for threshold in THRESHOLDS:
         heard = ((one.onset, replayed(one, centre, slope, threshold)) for one in told(chosen_ones))

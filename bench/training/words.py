@@ -85,7 +85,7 @@ class Mixed:
 
 @dataclass(frozen=True)
 class Listener:
-    """An engine that keeps the frames it is given."""
+    """In place of an engine: stores the frames that it is given."""
 
     stft: StftConfig
     frames: list[Frame]
