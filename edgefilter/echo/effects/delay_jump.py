@@ -36,7 +36,7 @@ class DelayJump(Effect):
     name = "delay_jump"
     stage = "source"
     family = "time"
-    run_note = "the running filter finds jumps by itself, and those found are of this recording only: adding them to the profile does not change it"
+    run_note = "the running filter finds jumps by itself, and those found are of this recording only: adding them changes nothing there"
     title = "a delay jump"
     event = True
     followed = True
