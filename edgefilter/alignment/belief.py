@@ -35,7 +35,7 @@ is found in all; with looks of 2 s not in two whose lag changes faster, or whose
 JUMP = 0.2
 """Probability that from one look to the next the lag is another: utterances last some 5 s, and each may have its own."""
 LEADS = 80
-"""Samples, 5 ms, by which the loudest of a path's arrivals, or one as loud by turns, may be away from the direct sound."""
+"""Largest distance in samples, 5 ms, of a path's loudest arrival from the direct sound; also of one that is the loudest now and then."""
 CLEAR_DB = 0.5
 """Reverberation after its sound over what is before it, 0.5 to 8 dB in 33 real pairs, tuned on, and as much below zero where they are
 swapped; where a reflection is louder than the direct sound it is the other way round, so a lag of more than LEADS samples is no sign of

@@ -41,7 +41,7 @@ class PathFit:
     decays_s: tuple[float, ...] = (0.15, 0.4)
     """Reverberation times that the penalty on the taps supposes; the one that predicts best is kept."""
     moment: int = SAMPLE_RATE // 20
-    """Samples over which the disturbance is measured that the fit gives way to."""
+    """Samples over which a disturbance is averaged; the fit gives less weight to what is disturbed."""
     others_db: float = 6.0
     """How far above the robot something is that is not the robot's."""
     most_ppm: float = 400.0

@@ -65,10 +65,10 @@ def _forward(bench: Workbench, model: EchoModel, wanted: Sequence[str]) -> tuple
 
 
 def _followed(wanted: Sequence[str]) -> list[str]:
-    """Names of the effects that the running filter follows, less noise, the wanted ones and what a wanted one holds.
+    """Names of the effects that the running filter follows, without noise, the wanted ones and those that a wanted one includes.
 
-    A flexible effect on the path has the volume in it: beside it a gain is anything. A lag by time of the user's own has
-    the clocks in it. Noise moves no fit.
+    A flexible effect on the path includes the volume: beside it a gain could have any value. A lag over time of the user's own
+    includes the drift of the clocks. Noise changes no fit.
     """
     wished = [find(name) for name in wanted]
     left = {

@@ -240,10 +240,10 @@ class Inquiry:
     def ask(
         self, play: Callable[[Sound], Samples], seconds: float, progress: Callable[[str], None] | None = None
     ) -> Answer:
-        """Play the best sound for what stands, and again, until the odds are ENOUGH or the seconds are over.
+        """Play the sound that best tells the remaining explanations apart, again and again, until the odds are ENOUGH or the time is over.
 
-        play: gives what is recorded of a sound and for a second after it. Raises SignalError where no sound tells them
-        apart, or what is recorded does not contain it.
+        play: plays a sound and returns the recording of it and of the second after it. Raises SignalError where no sound tells the
+        explanations apart, or the recording does not contain the sound.
         """
         heard: list[Heard] = []
         gains: list[Array] = []
@@ -431,10 +431,10 @@ def _cells(recording: Straightened, model: EchoModel) -> tuple[Array, Array, Arr
 
 
 def _log_likelihood(prepared: Straightened, explanations: Sequence[Explanation]) -> Array:
-    """Log likelihood of the cells that no fit has used, (moments, explanations + 1), the last of none of them.
+    """Log likelihood of the held-out time-frequency cells, (moments, explanations + 1); the last column is of no explanation.
 
-    Student's t with as many degrees of freedom as the cell has (Lange, Little & Taylor 1989): what is louder than
-    expected counts by its level, and what was expected in vain counts as well.
+    Student's t with as many degrees of freedom as the cell has (Lange, Little & Taylor 1989): a cell that is louder than expected counts
+    by its level in dB, and one that is softer than expected counts as well.
     """
     freedom = bands().freedom * (STEP / (HOP - 1))
 

@@ -43,17 +43,17 @@ TOLERANCE_TAPS = 32
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """Of one prediction.
+    """Score of one prediction.
 
-    level_db: negative log likelihood of the residual's cells of time and frequency, in dB for each degree of freedom:
+    level_db: negative log likelihood of the residual's time-frequency cells, in dB for each degree of freedom:
     Student's t of as many degrees as a cell has (Lange, Little & Taylor 1989, "Robust statistical modeling using the t
-    distribution"), around the noise that the model expects. Far over that it is the mean of the cells' dB: many cells
-    count, not the loudest. Noise that a model expects on top of the ordinary costs half of its dB: else anything could
-    be called noise. over_db: the same without that cost. floor_db: that of the cells in which the robot is silent, 0 where it
-    never is: what is left at best.
-    excess_db: mean power of the held-out whitened residual, dB. active_db, silent_db: while the robot is heard, and is
-    not. Noise that a model expects counts as fan in these; irreducible_db: the excess over the fan alone then, else 0.
-    cells: (times, bands) power over the fan. prediction: (n,) with the ordinary tolerances taken up.
+    distribution"), around the noise that the model expects. For a residual far above that noise it is the mean of the cells' dB, so many
+    cells count, not the loudest. Noise that a model expects beside the fan costs half of its dB, since otherwise anything could be called
+    noise. over_db: the same without that cost. floor_db: the same of the cells in which the robot is silent, 0 where it never is: the
+    best that can be reached.
+    excess_db: mean power of the held-out whitened residual, dB; active_db, silent_db: the same while the robot is heard, and while it
+    is not. In these three, noise that the model expects counts as fan; irreducible_db: the excess over the fan alone where it expects
+    such noise, else 0. cells: (times, bands) power over the fan. prediction: (n,), with the ordinary tolerances fitted.
     """
 
     level_db: float

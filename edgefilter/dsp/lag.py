@@ -48,9 +48,10 @@ def flat_cross(a: Array, b: Array, n: int) -> np.ndarray:
 
 
 def likely_cross(predicted: Samples, recording: Samples, n: int) -> np.ndarray:
-    """Cross-spectrum Y P* / (|P|^2 + N) of two signals in noise of variance 1, (n // 2 + 1,): flat where the voice stands out.
+    """Cross-spectrum Y P* / (|P|^2 + N) of prediction P and recording Y, (n // 2 + 1,): flat where the voice is above the noise.
 
-    The maximum-likelihood weighting of Knapp & Carter (1976) for an error in proportion to the voice.
+    N is the power of noise of variance 1 in a bin. The maximum-likelihood weighting of Knapp & Carter (1976) where the prediction is
+    wrong in proportion to the voice.
     """
     source = fft.rfft(predicted.astype(np.float64), n)
     heard = fft.rfft(recording.astype(np.float64), n)

@@ -207,7 +207,7 @@ class FrontEnd:
         return mic if self.microphones is None else mic[self.microphones.first]
 
     def _spectra(self, *signals: Samples, wait: int) -> Spectrum:
-        """Spectra of k signals (hop,) that are `wait` samples late, (k, bins)."""
+        """Spectra of k signals (hop,), each delayed by `wait` samples, (k, bins)."""
         spectra = self._analyser.push(*signals, wait=wait)
         if self.cut is not None:
             spectra *= self.cut

@@ -225,7 +225,7 @@ class Duplex:
         return samples if samples.ndim == 1 else samples[:, 0]
 
     def events(self) -> list[Event]:
-        """What happened since the last call, oldest first, where no on_event takes it; turns as of `EgoFilter.events`."""
+        """Events since the last call, oldest first, unless on_event takes them; their `turn` is as in `EgoFilter.events`."""
         with self._queue_lock:
             return [self._kept.popleft() for _ in range(len(self._kept))]
 

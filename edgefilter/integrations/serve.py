@@ -312,7 +312,7 @@ class Service:
             await self._send(connection, answers)
 
     async def _turn(self, session: Session) -> None:
-        """Wait for the next turn of the event loop; where the session can wait, for its turn among such, when all others rest."""
+        """Yield to the event loop; a session that can wait queues with other such sessions until all urgent ones are idle."""
         await asyncio.sleep(0)
         if session.can_wait:
             async with self._backlog:

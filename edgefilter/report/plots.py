@@ -24,7 +24,7 @@ INK, ACCENT, SOFT = "#222222", "#b5442c", "#5b7c99"
 def plot_profile(profile: Profile, path: str | Path) -> None:
     """Draw impulse response, decay, both readings of the response with the fan, and the bands, to a PNG, SVG or PDF.
 
-    Below them, where the profile knows it: what a linear path makes of the voice at each level, and what it leaves.
+    Below them, where the profile holds them: at each level of the voice the echo that a linear path explains, and the residual.
     """
     known = profile.approximation
     figure = _figure(11, 8 if known is None else 11.5)

@@ -266,7 +266,7 @@ def _finding(rank: int, finding: Finding) -> list[str]:
 
 
 def heading(finding: Finding) -> str:
-    """Name a finding; a free law by the listed effect whose few numbers bring a share of its gain."""
+    """Title of a finding; a free law is named after the listed effect that brings a share of its gain with few parameters."""
     share = f", {100 * finding.like.share:.0f} % of {spoken(finding.effect)}" if finding.like else ""
     return title(finding.name) + share
 

@@ -95,7 +95,7 @@ class _Ground:
         self.lag = PRE_ROLL if ahead else 0
 
     def part(self, x: Samples) -> Samples:
-        """What a part (n,) of x becomes at the microphone, whitened."""
+        """Sound at the microphone, whitened, that a component x (n,) of the reference causes through the path."""
         return self._measurement.heard(self._model, x) if self._ahead else self._measurement.whiten(x)
 
     def solve(self, parts: Sequence[Samples], bends: Array) -> Array:

@@ -10,7 +10,7 @@ from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.types import SAMPLE_RATE, Samples
 
 HARD, HARDNESS = 100.0, (10.0, 5.0, 3.0, 2.0)
-"""The hardness from which on it is a clip, and the softer ones that are tried."""
+"""Hardness of the curve from which on it counts as hard clipping, and the softer ones that are tried."""
 STEPS = 1.0 - np.array([0.0, 0.01, 0.02, 0.04, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5])
 """Levels that are tried, re the recording's largest sample."""
 
