@@ -125,7 +125,10 @@ def broken(folder: Path, case: str) -> None:
         ("none", "holds no *_lpb and *_mic files"),
         ("lone", "x_farend_singletalk without its _lpb file"),
         ("rate", "8000 Hz, 1 channels, expected 16000 Hz mono"),
-        ("length", "x_farend_singletalk: 3.00 s of microphone and 7.00 s of loopback, expected lengths within 1 s of each other"),
+        (
+            "length",
+            "x_farend_singletalk: 3.00 s of microphone and 7.00 s of loopback, expected lengths within 1 s of each other",
+        ),
         ("empty", "x_farend_singletalk: 0.00 s of microphone"),
         ("short", "x_farend_singletalk: 3.0 s, expected 4.0 s for this human"),
         ("nobody", "holds no transcripts.tsv"),
