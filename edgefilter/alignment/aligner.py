@@ -406,9 +406,8 @@ class Aligner:
         self._resolve()
         if not self._known or abs(found.lag - self._drift.delay) > SAME:
             return self._switch(float(found.lag))
-        if (
-            self._gain is None
-        ):  # searches agree on the lag, but no measurement finds a peak: the arrival is spread over time, so its shape is learned
+        if self._gain is None:
+            # searches agree on the lag, but no measurement finds a peak: the arrival is spread over time, so its shape is learned
             self._meter = self._new_meter()
             drift, now = self._drift, self._ref.end
             self._meter.study(self._mics[self._used[0]], self._ref, now - WINDOW, now, drift.delay, drift.slope)

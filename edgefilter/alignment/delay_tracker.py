@@ -147,7 +147,8 @@ class DelayMeter:
         correlation = fourier.irfft(np.array(products), SIZE)
         likelihood = np.concatenate((correlation[:, -REACH:], correlation[:, :REACH]), axis=1).ravel()
         overlap = np.concatenate([_overlap(reference) for reference in references])
-        likelihood /= np.sqrt(overlap + 0.1 * overlap.max() + 1e-30)  # at the middle the delay is the expected one
+        # by the energy of the first difference: a constant offset of the reference has none
+        likelihood /= np.sqrt(overlap + 0.1 * overlap.max() + 1e-30)
         expected = likelihood.size // 2
         at, strength, ratio = max(
             (_highest(likelihood, reach) for reach in {REACH, expected}), key=lambda found: found[1] * found[2]

@@ -34,9 +34,7 @@ class Microphones:
     def __init__(self, count: int, hop: int, paths: Samples | None = None) -> None:
         self.count = count
         self.left_out: dict[int, str] = {}
-        self._paths = (
-            None if paths is None else paths[:, : TAPS[0]]
-        )  # taps of the direct sound and the early reflections
+        self._paths = None if paths is None else paths[:, : TAPS[0]]  # of the direct sound and the early reflections
         self._exchanged: dict[int, str] = {}
         self._played: set[int] = set()
         self._asked: set[int] = set()

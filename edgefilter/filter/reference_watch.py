@@ -61,7 +61,7 @@ class ReferenceWatch:
         self._speeds: Iterator[tuple[float, float] | None] = iter(())  # of the look that is under way
         self._to_compare, self._looks_left = LENGTH, SPEED_LOOKS
         self._steady = 0  # samples of the robot's speech that were heard at one lag
-        self._idle, self._unfound = True, False
+        self._idle, self._begun_displaced = True, False
         self._sustained, self._loudest, self._least = Sustained(), 0.0, float("inf")
         self._rise = 10 ** (hop / (10 * SAMPLE_RATE))
         self._levels: deque[float] = deque(maxlen=LOOKS)
@@ -75,7 +75,7 @@ class ReferenceWatch:
     @property
     def suspect(self) -> bool:
         """Whether the sound at the microphone may be the robot although no reference explains it: that comes late or never, or was late so far."""
-        return self.without or self._unfound or (self._displaced and not self._idle)
+        return self.without or self._begun_displaced or (self._displaced and not self._idle)
 
     @property
     def _displaced(self) -> bool:
@@ -98,7 +98,7 @@ class ReferenceWatch:
         begun = aligned.past.onsets.current
         if begun.end - begun.start == 2 * self._hop:
             self._loudest = 0.0
-        self._unfound = aligned.state == "begun" and (self._unfound or self._displaced)
+        self._begun_displaced = aligned.state == "begun" and (self._begun_displaced or self._displaced)
         self._idle = aligned.state in ("idle", "announced")  # announced speech is no reference before its echo is heard
         power, played = float(mic.dot(mic)) / self._hop, float(ref.dot(ref)) / self._hop
         self._loudest = max(self._loudest, self._sustained.step(power))

@@ -209,9 +209,7 @@ class _Command(MicProcessAsyncClient):
         assert process is not None
         with contextlib.suppress(ProcessLookupError):
             process.kill()
-        await (
-            process.communicate()
-        )  # a process whose output pipe is full never ends, so wait() alone would block for ever
+        await process.communicate()  # wait() alone would block for ever where the pipe of its output is full
 
 
 class _BoundedReader:

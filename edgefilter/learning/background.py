@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from edgefilter.echo.user_effects import loaded_files
 from edgefilter.filter.echo_path import FilteredHop, PathState, PathUpdate
-from edgefilter.learning.history import NOTHING, RECENT_S
+from edgefilter.learning.history import NOTHING_LEARNED, RECENT_S
 from edgefilter.profile.data import Profile
 from edgefilter.types import SAMPLE_RATE
 
@@ -72,7 +72,7 @@ class BackgroundLearner:
         self._profile, self._remember = profile, remember
         self._worker: _Worker | None = None
         self._update: PathUpdate | None = None
-        self._stats: dict[str, object] = dict(NOTHING)
+        self._stats: dict[str, object] = dict(NOTHING_LEARNED)
         self._stream = 0
 
     @property
@@ -84,7 +84,7 @@ class BackgroundLearner:
         """A stream begins: what was learned of one before is forgotten."""
         self.close()
         self._path, self._hop, self._stream = path, hop, 0
-        self._stats = dict(NOTHING)
+        self._stats = dict(NOTHING_LEARNED)
         with suppress(OSError):  # no memory for another process, or no interpreter: the filter goes on without
             self._worker = _Worker()
             self._finalizer = weakref.finalize(self, self._worker.end)

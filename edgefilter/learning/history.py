@@ -11,10 +11,10 @@ from edgefilter.filter.echo_path import TAPS, EchoPath, FilteredHop
 from edgefilter.filter.volume import pre_emphasised
 from edgefilter.types import SAMPLE_RATE, Samples
 
+NOTHING_LEARNED = {"rounds": 0, "learned": 0, "unlearned": 0, "remembered": 0, "heard_s": 0.0}
+"""What learning counts before it has begun: rounds of fits, paths taken over, given up again, and written to the file; seconds of robot."""
 MINUTE = 60.0
 """Seconds that are kept."""
-NOTHING = {"rounds": 0, "learned": 0, "unlearned": 0, "remembered": 0, "heard_s": 0.0}
-"""What learning counts before it has begun: rounds of fits, paths taken over, given up again, and written to the file; seconds of robot."""
 RECENT_S = 15.0
 """Seconds of the newest sound among them: enough to fit a loudspeaker and a room to, and as a rule all from where the robot stands now."""
 

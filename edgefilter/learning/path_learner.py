@@ -22,7 +22,7 @@ from edgefilter.errors import ProfileError
 from edgefilter.filter.canceller import COLD, Canceller
 from edgefilter.filter.echo_path import PAST, TAPS, EchoPath, Effects, FilteredHop, PathState, PathUpdate, starting_path
 from edgefilter.filter.volume import AUDIBLE, WITNESSES
-from edgefilter.learning.history import MINUTE, NOTHING, RECENT_S, HopHistory, emphasised
+from edgefilter.learning.history import MINUTE, NOTHING_LEARNED, RECENT_S, HopHistory, emphasised
 from edgefilter.profile.array import ArrayCalibration
 from edgefilter.profile.data import GRID_FFT, LEARNED, Profile
 from edgefilter.types import SAMPLE_RATE, EventKind, Samples, expect_positive
@@ -143,7 +143,7 @@ class PathLearner:
 
     def __init__(self, profile: Profile | None = None, remember: Path | None = None) -> None:
         self._profile, self._remember = profile, remember
-        self._counts = dict(NOTHING)
+        self._counts = dict(NOTHING_LEARNED)
         self._audible_s = 0.0
         self._snapshot: tuple[PathState, int] | None = None
 
@@ -160,7 +160,7 @@ class PathLearner:
             )
         self._audible_s, self._next_s, self._peak, self._sustained = 0.0, SCHEDULE.first_s, 0.0, Sustained()
         self._snapshot = None
-        self._counts = dict(NOTHING)
+        self._counts = dict(NOTHING_LEARNED)
 
     def observe(self, hop: FilteredHop) -> PathUpdate | None:
         """Take one hop; compare, and now and then fit."""

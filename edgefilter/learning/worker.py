@@ -18,10 +18,7 @@ from edgefilter.learning.path_learner import PathLearner
 
 def main() -> None:
     """Run until the other side closes standard input."""
-    for number in (
-        signal.SIGINT,
-        signal.SIGTERM,
-    ):  # it is meant for the filter; when that ends, standard input is at its end and so are we
+    for number in (signal.SIGINT, signal.SIGTERM):  # meant for the filter, whose end ends our standard input
         signal.signal(number, signal.SIG_IGN)
     if hasattr(os, "nice"):
         os.nice(10)
