@@ -51,6 +51,8 @@ class LiveSource(Source):
         if self._reference is not None:
             how = "what is played on " if isinstance(reference, SpokenReference) else ""
             self.notes += [f"reference: {how}{self._reference.port.device}", *self._reference.port.notes]
+            output, monitor, _ = self._reference.port.device.pulse_name.partition(".monitor")
+            self.monitored = output if monitor else ""
 
     def __enter__(self) -> LiveSource:
         try:

@@ -25,12 +25,14 @@ class Source(Protocol):
     notes: what was done to the sound on its way in (converted, padded, dropped), one sentence each, for the user to
     read; complete when the iteration has ended. total: samples per channel at 16 kHz, None if unknown beforehand.
     live: blocks arrive in real time. microphones: channels of a block's mic, which is (n,) where it is one.
+    monitored: the sound server's output whose monitor is the reference, '' where it is something else.
     """
 
     notes: list[str]
     total: int | None = None
     live: bool = False
     microphones: int = 1
+    monitored: str = ""
     _stopped: bool = False
 
     def __enter__(self: Itself) -> Itself:

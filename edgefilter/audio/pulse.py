@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import os
+import queue
 import re
 import subprocess
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -93,6 +95,69 @@ def leading_to(name: str, kind: str) -> Iterator[None]:
                 os.environ.pop(variable, None)
             else:
                 os.environ[variable] = before
+
+
+class Programs:
+    """Lowers the streams that programs play on an output of the server, and raises them again.
+
+    A thread of its own asks the server, which takes some 10 ms each time. output: the output's name. refused: called once with
+    the reason where no program can be lowered: with flat volumes the server turns the output itself down, which its monitor
+    does not show.
+    """
+
+    def __init__(self, output: str, refused: Callable[[str], None]) -> None:
+        self._output, self._refused = output, refused
+        self._wanted: queue.SimpleQueue[float | None] = queue.SimpleQueue()
+        self._lowered: dict[str, float] = {}
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> Programs:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        """Leave every stream as loud as it was found."""
+        self._wanted.put(None)
+        self._thread.join()
+
+    def fade(self, gain: float) -> None:
+        """Let the programs go on with this gain, above 0 and at most 1; returns at once."""
+        self._wanted.put(gain)
+
+    def _run(self) -> None:
+        tried = False
+        while (gain := self._wanted.get()) is not None:
+            self._raise()
+            if gain < 1.0:
+                before = "" if tried else _asked("get-sink-volume", self._output)
+                self._lower(20.0 * math.log10(gain))
+                if not tried and _asked("get-sink-volume", self._output) != before:
+                    self._refused(
+                        "a program's volume moves that of the output: set flat-volumes = no in PulseAudio's daemon.conf"
+                    )
+                    break
+                tried = True
+        self._raise()
+
+    def _lower(self, db: float) -> None:
+        for stream in streams_on(self._output):
+            with suppress(DeviceError):  # it has ended
+                pactl("set-sink-input-volume", stream, f"{db:+.2f}dB")
+                self._lowered[stream] = db
+
+    def _raise(self) -> None:
+        for stream, db in self._lowered.items():
+            with suppress(DeviceError):
+                pactl("set-sink-input-volume", stream, f"{-db:+.2f}dB")
+        self._lowered.clear()
+
+
+def streams_on(output: str) -> list[str]:
+    """Numbers of the streams that programs play on an output of the server now."""
+    outputs = (line.split("\t") for line in _asked("list", "short", "sinks").splitlines())
+    numbers = [each[0] for each in outputs if len(each) > 1 and each[1] == output]
+    streams = (line.split("\t") for line in _asked("list", "short", "sink-inputs").splitlines())
+    return [each[0] for each in streams if len(each) > 1 and each[1] in numbers]
 
 
 def pactl(*words: str) -> str:

@@ -46,6 +46,7 @@ def main(args: argparse.Namespace) -> int:
     profile = Profile.load(file) if file else None
     channels = channels_of(args, profile)
     source = make_source(args, speech, channels)
+    check_asking(args, source)
     if channels is not None and args.mic_channels is None:
         source.notes.append(f"all {source.microphones} channels are microphones, since the profile is of an array")
     ego, choice = make_filter(args, source.live, profile)
@@ -98,7 +99,7 @@ def check_output(name: str) -> None:
 def make_speech(args: argparse.Namespace) -> SpokenReference | None:
     """The speech that the run itself plays, None where no --play asks for it."""
     if args.play is None:
-        given = {"--speaker": args.speaker, "--barge-in": args.barge_in, "--ask-db": args.ask_db or None}
+        given = {"--speaker": args.speaker, "--barge-in": args.barge_in}
         if option := next((option for option, value in given.items() if value is not None), None):
             raise UsageError(f"{option} concerns the speech that --play plays, found none: give --play FILE")
         return None
@@ -144,6 +145,16 @@ def make_source(args: argparse.Namespace, speech: SpokenReference | None, channe
         played_on = args.output if is_device(args.output) and args.output != virtual.HUMAN else "default"
         reference = own or monitor_of(played_on)
     return LiveSource(mic, reference, patience_s=math.inf, channels=channels)
+
+
+def check_asking(args: argparse.Namespace, source: Source) -> None:
+    """Raise UsageError where the robot is to be asked to lower its voice, and nobody can lower it."""
+    if args.ask_db and args.play is None and not source.monitored:
+        found = "a recording" if not source.live else "a reference that is no monitor of the sound server"
+        raise UsageError(
+            f"--ask-db lowers what --play plays, or what programs play on an output of the sound server, found {found}:"
+            " give --input mic, and --play FILE or the monitor of an output as --reference ('edgefilter devices')"
+        )
 
 
 def make_sink(name: str, latency: int, wait: bool) -> Sink:

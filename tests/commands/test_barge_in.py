@@ -78,13 +78,14 @@ def test_a_command_that_does_not_end_is_killed_with_its_children_and_not_multipl
 def test_the_robot_is_lowered_while_the_filter_asks_for_it_and_stopped_for_good_or_lowered_while_the_human_speaks(
     how, gains
 ):
-    speech, ego = SimpleNamespace(gains=[]), SimpleNamespace()
-    speech.fade = speech.gains.append
-    lowering = Lowering(speech, ego, how)
+    faded, heard, ego = [], [], SimpleNamespace()
+    lowering = Lowering(faded.append, ego, how)
     for event, gain in ((GAIN, 0.25), (STARTED, 1.0), (GAIN, 1.0), (STOPPED, 1.0)):
         ego.voice_gain = gain
         lowering.hear(event)
-    assert speech.gains == pytest.approx(gains)
+        heard.append(faded[-1])
+    assert heard == pytest.approx(gains)
+    assert all(one != other for one, other in zip(faded, faded[1:]))  # a sound server is not told twice
 
 
 @pytest.mark.parametrize(
@@ -133,6 +134,10 @@ def test_an_engine_that_tells_no_speech_is_said_once_and_one_that_does_is_not():
         (["--input", "mic", "--barge-in", "stop"], "--barge-in concerns the speech that --play plays"),
         (["--input", "mic", "--barge-in", "shout", "--play", "x.wav"], "'shout'"),
         (["--input", "mic", "--speaker", "x"], "--speaker concerns"),
+        (
+            ["--input", str(DEMO / "mic.flac"), "--reference", str(DEMO / "reference.flac"), "--ask-db", "12"],
+            "found a recording",
+        ),
         (["--input", "-", "--play", "x.wav"], "found --input -"),
         (["--input", "mic", "--reference", "monitor", "--play", "x.wav"], "found --reference monitor"),
         (["--input", "mic", "--play", ""], "is not the name of a file"),

@@ -1,4 +1,4 @@
-"""`edgefilter run --play`: the robot's speech is played, ends when somebody speaks, and is the reference meanwhile."""
+"""What the robot says while somebody speaks: the speech of `edgefilter run --play`, and that of other programs."""
 
 import json
 import subprocess
@@ -72,3 +72,58 @@ def test_the_played_speech_is_the_reference_is_lowered_to_hear_who_speaks_and_en
         assert share(from_loudspeaker, reference) > 0.3
     else:  # whose graph runs at 48 kHz: no sample stays what it is
         assert arrived(from_loudspeaker.astype(np.float32), reference[first:ended].astype(np.float32)) > 0.95
+
+
+def test_what_another_program_plays_is_lowered_to_hear_who_speaks_and_is_as_loud_as_before_afterwards(
+    loopback, tmp_path
+):
+    said = soundfile.read(DEMO / "reference.flac", dtype="float32")[0]
+    robot = sum(
+        np.roll(said, turn) for turn in range(0, said.size, 11_000)
+    )  # never pauses: only a robot that talks is asked
+    soundfile.write(tmp_path / "robot.wav", 0.3 * np.tile(robot, 3) / np.abs(robot).max(), 16_000, "PCM_16")
+    human = 10 * soundfile.read(DEMO / "human.flac", dtype="float32")[0]
+    begins = int(np.argmax(np.abs(human) > 0.1))
+    soundfile.write(tmp_path / "human.wav", human[begins - 4000 : begins + 24_000], 16_000, "PCM_16")
+    noise = 1e-4 * np.random.default_rng(0).standard_normal(20 * 16_000)  # a microphone's own
+    soundfile.write(tmp_path / "noise.wav", noise, 16_000, "PCM_16")
+    programs = [
+        subprocess.Popen(["paplay", "-d", sink, tmp_path / f"{name}.wav"], env=loopback.environment)
+        for sink, name in (("robot_mic", "noise"), ("robot", "robot"))
+    ]
+
+    def volumes():
+        listed = subprocess.run(
+            ["pactl", "list", "sink-inputs"], env=loopback.environment, capture_output=True, text=True
+        )
+        return [line for line in listed.stdout.splitlines() if "Volume" in line]
+
+    live = subprocess.Popen(
+        argv(
+            "run", "--input", "mic", "--engine", "crnn", "--ask-db", 12, "--no-learn", "--seconds", 7,
+            "--record", tmp_path / "heard", "--output", tmp_path / "out.wav",
+        ),
+        env=loopback.environment, cwd=ROOT, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    heard = tmp_path / "heard/mic.wav"
+    while live.poll() is None and not (heard.exists() and heard.stat().st_size > 3 * 64_000):
+        time.sleep(0.05)
+    before = volumes()
+    subprocess.run(["paplay", "-d", "robot_mic", tmp_path / "human.wav"], env=loopback.environment, check=True)
+    _, told = live.communicate(timeout=60)
+    after = volumes()
+    for program in programs:
+        program.terminate(), program.wait()
+    assert live.returncode == 0 and "reference: robot.monitor" in told, told
+
+    events = [json.loads(line) for line in (tmp_path / "heard/events.jsonl").read_text().splitlines()]
+    kinds = [event["kind"] for event in events]
+    assert "speech_started" in kinds[kinds.index("voice_gain") :], kinds
+    lower, higher = [event["time"] for event in events if event["kind"] == "voice_gain"][:2]
+    reference = soundfile.read(tmp_path / "heard/reference.wav", dtype="float32")[0]
+    loud = [
+        np.sqrt(np.mean(reference[round(16_000 * start) : round(16_000 * end)] ** 2))
+        for start, end in ((lower - 0.5, lower), (lower + 0.1, higher), (higher + 0.15, higher + 0.65))
+    ]
+    assert loud[1] < 0.5 * min(loud[0], loud[2]), (loud, lower, higher)
+    assert before == after and len(after) > 1, (before, after)
