@@ -11,6 +11,9 @@ def main() -> int:
     """Run the command line; SIGINT and SIGTERM end it cleanly from the start, later each command sets handlers of its own."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _leave)
+    # before numpy is loaded: the filter and its learner have a core each, and on a busy machine threads of numpy's linear algebra
+    # take more time to wait for one another than they save
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     from edgefilter.cli import main
 
     return main()

@@ -124,6 +124,18 @@ def test_the_program_begins_where_it_can_be_interrupted():
     assert program.value == "edgefilter.__main__:main"
 
 
+@pytest.mark.parametrize(("given", "expected"), [({}, "1"), ({"OMP_NUM_THREADS": "2"}, "2")])
+def test_the_program_computes_in_one_thread_unless_more_are_asked_for(given, expected):
+    code = (
+        "import os, sys, edgefilter.__main__ as program; print('numpy' in sys.modules); sys.argv[1:] = ['--version']\n"
+    )
+    code += "try: program.main()\nexcept SystemExit: print(os.environ['OMP_NUM_THREADS'])"
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"} | given
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    loaded, *_, threads = done.stdout.split()
+    assert loaded == "False" and threads == expected
+
+
 def test_what_was_done_to_a_file_is_said(speech):
     soundfile.write(speech / "short.wav", np.full((100, 2), 0.1), 8000)
     result = run(speech, "--reference", speech / "short.wav")
