@@ -1,6 +1,7 @@
 """The command line as people use it, good input and every kind of bad one; in a process of its own where that matters."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -126,10 +127,14 @@ def test_the_program_begins_where_it_can_be_interrupted():
 
 @pytest.mark.parametrize(("given", "expected"), [({}, "1"), ({"OMP_NUM_THREADS": "2"}, "2")])
 def test_the_program_computes_in_one_thread_unless_more_are_asked_for(given, expected):
-    code = (
-        "import os, sys, edgefilter.__main__ as program; print('numpy' in sys.modules); sys.argv[1:] = ['--version']\n"
-    )
-    code += "try: program.main()\nexcept SystemExit: print(os.environ['OMP_NUM_THREADS'])"
+    code = """if True:
+        import os, sys, edgefilter.__main__ as program
+        print("numpy" in sys.modules)
+        sys.argv[1:] = ["--version"]
+        try:
+            program.main()
+        except SystemExit:
+            print(os.environ["OMP_NUM_THREADS"])"""
     environment = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"} | given
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     loaded, *_, threads = done.stdout.split()
