@@ -59,7 +59,7 @@ CONFIRM: Option = {
     "type": number(0.0, 10.0, "a time from 0 to 10 s", closed=True),
     "default": BargeInSettings.confirm_s,
     "metavar": "S",
-    "help": "longest time from the suspicion that the human speaks to certainty; 0: the suspicion is enough (default: %(default)g)",
+    "help": "longest time, in seconds, from the suspicion that the human speaks to certainty; 0: the suspicion is enough (default: %(default)g)",
 }
 FALSE_STARTS: Option = {
     "dest": "threshold",

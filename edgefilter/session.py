@@ -91,7 +91,7 @@ class Verdict:
 
     @classmethod
     def of(cls, progress: Progress, stats: Stats, noticed: int | None, wrong: list[str]) -> Verdict:
-        """The verdict on a run that has ended; wrong: what its events said."""
+        """The verdict on a run that has ended. noticed: as of the class. wrong: the messages of its events that told of a wrong set-up."""
         alignment = stats["alignment"] or {}
         lag = alignment.get("delay_samples")
         if not wrong and alignment and lag is None and progress.robot_s >= UNFOUND_S:

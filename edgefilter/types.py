@@ -90,7 +90,7 @@ _Device: TypeAlias = Literal["lost", "overrun", "underrun", "device_gone", "devi
 EventKind: TypeAlias = Literal[_Speech, _Filter, _SetUp, _Device]
 
 SET_UP_WRONG: tuple[EventKind, ...] = get_args(_SetUp)
-"""Kinds that say that something was connected wrongly, once each time it begins."""
+"""Kinds of event that report a wrong connection, one event each time that one begins."""
 
 
 class Turn(NamedTuple):
@@ -164,9 +164,9 @@ class AlignmentCounts(TypedDict, total=False):
 class AlignmentStats(AlignmentCounts, total=False):
     """What the aligner found.
 
-    Method "tracking" has all keys but utterances_aligned; "paper" has the first, delay_samples, confidence and
-    utterances_aligned. probability: that the delay is right, 0 to 1; deviation_samples: the standard deviation of the
-    delay if it is. confidence: of "tracking" the probability under its earlier name, of "paper" a correlation.
+    Method "tracking" has all keys but utterances_aligned; "paper" has method, delay_samples, confidence and
+    utterances_aligned. probability: that the delay is right, 0 to 1; deviation_samples: the standard deviation of a delay
+    that is right. confidence: with "tracking" the same as probability, its earlier name; with "paper" a correlation.
     """
 
     method: Literal["tracking", "paper"]
@@ -257,7 +257,8 @@ def as_samples(x: object, name: str) -> Samples:
     array = np.asarray(x)
     if array.dtype.kind != "f":
         how = "divide integer PCM by its full scale"
-        if array.dtype.itemsize == 1 or array.dtype.kind == "S":  # bytes, as the raw streams of sounddevice have them
+        # bytes in place of an array, as sounddevice's raw streams hand them over
+        if array.dtype.itemsize == 1 or array.dtype.kind == "S":
             how = (
                 "of bytes make samples first, numpy.frombuffer(buffer, numpy.float32), or numpy.int16 and then / 32768"
             )

@@ -20,7 +20,7 @@ from edgefilter.errors import EdgefilterError, ModelError
 from export.onnx_export import load
 
 MOST_BYTES = 16_000_000
-"""A repository without special storage takes no larger file gladly."""
+"""Size of a file, bytes, that a git repository holds without large-file storage: by definition."""
 
 
 def shrink(checkpoint: Path, output: Path, full: bool = False, others: Sequence[Path] = ()) -> int:

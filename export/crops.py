@@ -78,7 +78,7 @@ class Batches:
         return batch
 
     def ends(self, names: list[str], seconds: float) -> dict[str, Tensor]:
-        """The last seconds of these items, as they are."""
+        """The last seconds of the items of these names, unprocessed."""
         samples = self._whole_hops(seconds)
         places = [(name, self.items.length(name) // self.stft.hop * self.stft.hop - samples) for name in names]
         return _weighed(self._spectra(self._cut(places, samples)), self.stft)

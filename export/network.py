@@ -111,13 +111,13 @@ class Upward(nn.Module):
 
 
 class EdgeCrnn(nn.Module):
-    """Spectra of error, mic, reference, echo, powers of noise and residual to two spectra of the human and the probability of speech.
+    """Maps the spectra of error, mic, reference and echo, and the powers of noise and residual, to the human and the probability of speech.
 
-    The first spectrum is to listen to, the second for a recogniser, which minds a fan less than gaps in a voice: a head of two
-    convolutions corrects the first one's mask.
+    The human is two spectra. The first is to listen to, the second for a recogniser, to which a fan does less harm than gaps in a
+    voice: a head of two convolutions corrects the first one's mask.
 
-    The state is the previous frame's features of either branch (batch, 6, bands), the power of the prior's previous answer
-    (batch, bins) and the GRU's (layers, batch, hidden).
+    The state is the previous frame's features of each of the two branches (batch, 6, bands), the power of what the prior mask left
+    of the previous frame (batch, bins) and the GRU's (layers, batch, hidden).
     """
 
     def __init__(self, config: EdgeConfig = EdgeConfig()) -> None:

@@ -128,7 +128,7 @@ class EdgeTask:
         return terms, listen
 
     def _targets(self, batch: Mapping[str, Tensor], scale: Tensor, clean: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Of each sound the true voice and what is wanted of it; of --like both are the sound as that network makes it."""
+        """Of each sound the clean voice and what the network should give; with --like both are what the network that it names gives."""
         if self.like is None:
             return [(clean, clean + kept * (scale * batch["fan"])) for kept in self.fans_kept]
         inputs, like = [batch[name] for name in INPUTS], self.like.to(clean.device)

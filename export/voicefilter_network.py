@@ -24,7 +24,7 @@ QUIET = 1e-4
 class VoiceFilterConfig:
     """Widths, small ones: Wang et al. have 64 channels, 8 of the last convolution, 400 recurrent and 600 dense units.
 
-    n_fft, hop: of the transform, whose root-Hann window is as long as the FFT. d_vector: values of one.
+    n_fft, hop: of the transform, whose root-Hann window is as long as the FFT. d_vector: length of a speaker's embedding.
     """
 
     n_fft: int = 512

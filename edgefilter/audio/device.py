@@ -42,7 +42,7 @@ def _of_portaudio() -> list[Device]:
 
 
 def _devices() -> list[Device]:
-    """PortAudio's devices, then the sound server's inputs and outputs: copies of the PortAudio device through which the server is opened."""
+    """PortAudio's devices, then each input and output of the sound server as a copy of the PortAudio device that opens the server."""
     found = _of_portaudio()
     served = []
     for kind in ("input", "output"):
@@ -87,7 +87,7 @@ def output_port(name: Named, queued: int, margin_s: float = 0.0, latency_s: floa
 
 
 def speaker(output: Named, speech: Reader) -> SpokenReference:
-    """Speech for an output device, to be the reference of a LiveSource."""
+    """Play this speech on an output device; what is played is the reference of the LiveSource that gets the result."""
     spoken = SpokenReference(_sounddevice(), find(output, "output"), speech.chunks())
     spoken.notes += speech.notes
     return spoken
@@ -138,8 +138,8 @@ def _rank(device: Device, text: str) -> int | None:
 def monitor(devices: Sequence[Device], output: Device) -> Device:
     """The input that gets what output plays, by the names that PulseAudio, PipeWire and Windows give it.
 
-    Those are 'Monitor of NAME', 'NAME.monitor' ('_', '-' or a space between as well) and 'NAME [Loopback]'. For an
-    output that only leads to the sound server, the single monitor there is. Raises UsageError where there is none or
+    Those are 'Monitor of NAME', 'NAME.monitor' (or '_', '-' or a space in place of the dot) and 'NAME [Loopback]'. Of an
+    output that stands for the whole sound server, 'pulse' say, it is the only monitor there is. Raises UsageError where there is none or
     more than one.
     """
     plain = _plain(output.name)

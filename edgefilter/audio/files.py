@@ -48,7 +48,7 @@ def open_source(
         return FileSource(path, reference, channels=channels)
     if channels is not None:
         raise UsageError(
-            f"'{path}' as input is stereo, microphone and reference, found channels asked for: give a file or a device"
+            f"'{path}' as input is stereo, microphone and reference, so its channels cannot be named: give a file or a device, which may have more"
         )
     if reference is not None:
         raise UsageError(
@@ -380,7 +380,7 @@ def write_file(path: str | Path, samples: Samples, float32: bool = False) -> Non
 
 
 class Recorder:
-    """FOLDER/mic.wav, reference.wav and output.wav, 32-bit float: exactly the samples of the blocks, and the filter's.
+    """FOLDER/mic.wav, reference.wav and output.wav, 32-bit float: exactly the samples that the filter got, and those that it gave.
 
     microphones: channels of mic.wav. A disk that is full ends the recording and not the run: what was written stays
     valid, and the error stands in `failure`. Raises AudioFileError where the folder or a file cannot be made.

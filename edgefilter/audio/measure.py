@@ -114,8 +114,8 @@ def play_through(output: Named, source: Source, samples: Samples) -> tuple[Sampl
 class Channel:
     """What one microphone of an array delivered.
 
-    number: of the device's channel. level_db, floor_db, peak_db: of full scale; the floor is the level that it has nine
-    tenths of the time at least. coherence: with the first microphone that is not silent, mean over 200 Hz to 4 kHz, 0
+    number: of the device's channel. level_db, floor_db, peak_db: of full scale; the floor is the level that it
+    exceeds nine tenths of the time. coherence: with the first microphone that is not silent, mean over 200 Hz to 4 kHz, 0
     to 1; 0 of silence.
     """
 

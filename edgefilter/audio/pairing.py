@@ -156,7 +156,7 @@ class Outlet:
         self.underruns = self.missing = self.calls = 0
 
     def deliver(self, out: Samples) -> None:
-        """Called by the audio thread to fill out (n,)."""
+        """Write the next samples into `out` (n,); the audio thread calls it."""
         self.calls += 1
         if self._waiting and (len(self.ring) >= self._margin or self.draining):
             self._waiting, self._started = False, True

@@ -121,7 +121,7 @@ class Programs:
         self._thread.join()
 
     def fade(self, gain: float) -> None:
-        """Let the programs go on with this gain, above 0 and at most 1; returns at once."""
+        """Let what these programs play go on with this gain, above 0 and at most 1; returns at once."""
         self._wanted.put(gain)
 
     def _run(self) -> None:

@@ -132,7 +132,7 @@ class Reader:
             raise self._error(f"is truncated: {held}; copy it again, or re-save what is there")
 
     def _blocks(self, file: soundfile.SoundFile) -> Iterator[Array]:
-        """Yield (n, channels) float32, SAMPLE_RATE values at a time; a decoder that gives up is an error with its place."""
+        """Yield (n, channels) float32, some SAMPLE_RATE values each; where a decoder gives up, the error says at which second."""
         size = max(1, SAMPLE_RATE // self.channels)
         done = 0
         try:

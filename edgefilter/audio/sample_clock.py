@@ -58,7 +58,7 @@ class SampleClock:
         return self.doubt_s > self._lateness.held_s
 
     def note(self, delivered_s: float, now: float) -> float:
-        """Take note of the seconds of sound that came so far, when no more is waiting; by how much `missed` has grown."""
+        """Take note of how many seconds of sound have come so far, all of them taken; return by how many seconds `missed` has grown."""
         delay, late = now - delivered_s, self._lateness
         if self._usual is None:
             self._usual = delay

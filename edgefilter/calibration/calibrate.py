@@ -200,7 +200,9 @@ def doubts(noises: Samples, results: list[Deconvolution]) -> list[str]:
     for at, apart in enumerate(level - np.median(level)):
         if abs(apart) > APART_DB:
             how = f"{abs(apart):.0f} dB {'louder' if apart > 0 else 'softer'}"
-            found.append(f"channel {at}: the fan is {how} there than elsewhere; another gain or kind?")
+            found.append(
+                f"channel {at}: the fan is {how} in it than in the others: another gain, or another kind of microphone?"
+            )
     for at, result in enumerate(results):
         lag = result.direct - results[0].direct
         if abs(lag) > FARTHEST:

@@ -17,7 +17,7 @@ from edgefilter.dsp.membrane import LOWEST_HZ
 from edgefilter.types import SAMPLE_RATE, Samples
 
 LEVEL_DB = -18.0
-"""Peak of the louder chirps, dB of full scale: as loud as speech of the robot's, which peaks some dB above."""
+"""Peak of the louder chirps, dB of full scale: their power is that of usual robot speech, whose peaks are some dB higher."""
 SOFTER_DB = 10.0
 """By how much every other pair is softer: what changes the level by itself makes less, or more, of it."""
 _, HIGHEST_HZ = BAND_HZ
@@ -28,7 +28,7 @@ ORDER = "UDudDUdu"
 LEAD = round(0.5 * SAMPLE_RATE)
 """Samples of silence before the first chirp, in which the room's noise is measured."""
 QUIET = round(0.1 * SAMPLE_RATE)
-"""Samples of it, the quietest of which count: a stream may begin with a noise of its own."""
+"""Samples of the quietest stretch of LEAD, which counts as the room's noise: a stream may begin with a click."""
 OVER_RMS = 12.0
 """Height of a correlation with the chirps over its root mean square from which they are there: noise has 5."""
 

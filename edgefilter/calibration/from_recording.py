@@ -272,7 +272,7 @@ def _warnings(seconds: float, talk: list[tuple[float, float]]) -> list[str]:
     if seconds == 0.0:
         told.append("the robot is hardly silent here: the quietest moments of the recording stand for the fan")
     elif seconds < 0.5:
-        told.append(f"only {seconds:.1f} s of the robot's silence: the fan is known roughly")
+        told.append(f"only {seconds:.1f} s in which the robot is silent: its fan is known only roughly")
     if talk:
         spans = ", ".join(f"{begin:.1f} to {end:.1f} s" for begin, end in talk)
         told.append(

@@ -45,13 +45,13 @@ BAND_HZ = (80.0, 7000.0)
 SPEECH_DB = (-376.44, 465.439, -157.745, 16.7124)
 """Density of average speech, dB: coefficients of the powers of lg f, f in Hz, 100 to 8000 (ITU-T P.50, 1999, 2.1)."""
 SWEEP_PART = 0.5
-"""Peak of the sweep over that of the loudest multisines; it is the louder of the two all the same."""
+"""Peak of the sweep over that of the loudest multisines; its mean power is the higher one all the same."""
 GROUP = 4
 """Of so many odd lines in a row one, drawn at random, is left out."""
 SMOOTHING_HZ = 30.0
 """Half the width over which lines are averaged at least: 30 lines, so that a density is good to 1 dB."""
 OVER_CHANCE = 3.0
-"""Standard deviations of the noise's own power from which on a distortion is told from it."""
+"""A distortion counts from so many standard deviations of the noise's power on: less may be the noise."""
 LEAST_SHARE = 0.1
 """The least share of the recorded power that the loudest multisines must explain; another sound explains none of it."""
 
@@ -298,8 +298,8 @@ def _doubts(profile: Profile, found: LinearApproximation, part: Samples, ppm: fl
     clipped = clipped_samples(part)
     if clipped.size:
         texts.append(
-            f"clipped: {clipped.size} samples while the multisines sound, which looks like distortion of the loudspeaker,"
-            " in all bands; lower the playback volume or the microphone gain and calibrate again"
+            f"clipped: {clipped.size} samples while the multisines sound: in all bands this would be taken for distortion of the"
+            " loudspeaker; lower the playback volume or the microphone gain and calibrate again"
         )
     alone = max(total_power(profile.noise_psd), ROUNDING_PSD * SAMPLE_RATE / 2)
     louder = decibels(np.array([total_power(psd) for psd in found.noise]) / alone)

@@ -90,7 +90,7 @@ class SweepLaw:
 
 
 def sweep_law(reference: Samples) -> SweepLaw:
-    """Recognise an exponential sweep; raise CalibrationError where reference is none."""
+    """The law of the exponential sweep that reference is; raises CalibrationError where it is none."""
     level = float(np.max(np.abs(reference), initial=0.0))
     if level < 1e-3:
         raise CalibrationError(

@@ -99,13 +99,17 @@ class Fitted:
                 lines += _values(name, values[name], len(self.names) > 1)
             lines += [f"{'recording':<12}{text}" for text in self.before.warnings]
         lines.append(proof_line(self.proof, self.unproven))
-        lines += [f"{'dropped':<12}{name}: with it the running filter would be worse" for name in self.dropped]
+        lines += [
+            f"{'dropped':<12}{name}: the running filter removes less of the robot with it" for name in self.dropped
+        ]
         kept = "happened in this recording and is kept with it: of others the profile predicts what it did before"
         lines += [f"NOTE        {name} {kept}" for name in self.names if find(name).event]
         lines += [f"NOTE        {name}: {note}" for name in self.names if (note := reach(find(name), values[name]))]
         if self.promised_db is not None and after_db > self.promised_db + PROMISE_DB:
             missing = f"{joined(self.dropped)} is not in it" if self.dropped else "no fit to all of it explains as much"
-            lines.append(f"NOTE        what is written leaves more than the diagnosis did: {missing}")
+            lines.append(
+                f"NOTE        the profile that is written leaves more of the robot's voice unexplained than the diagnosis did: {missing}"
+            )
         shown = round(before_db, 1), round(after_db, 1)  # a fan that is softer than it was has less than none
         if self.names and shown[1] >= shown[0] and abs(shown[1]) >= abs(shown[0]):
             what = "this effect does" if len(self.names) == 1 else "these effects do"

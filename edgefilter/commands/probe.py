@@ -59,7 +59,7 @@ def _inquiry(recording: Recording, wanted: list[tuple[str, ...]]) -> Inquiry:
     first, *others = ["+".join(effects) for effects in wanted]
     if not others:
         raise SignalError(
-            f"nothing to ask: {first} is named, and nothing else explains {100 * RIVAL:.0f} % of what it does"
+            f"nothing to ask: {first} is named, and no other effect explains {100 * RIVAL:.0f} % of what it does"
         )
     inquiry = recording.probe(wanted)
     if len(inquiry.explanations) < 2:

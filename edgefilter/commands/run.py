@@ -244,7 +244,7 @@ def check_request(args: argparse.Namespace, ego: EgoFilter, source: Source) -> N
             " calibrated with --mic-channels, or calibrate again with these"
         )
     if args.turns and not ego.judges_speech:
-        raise UsageError(f"--turns needs an engine that judges speech, found {ego.engine_name}: take crnn")
+        raise UsageError(f"--turns needs an engine that detects speech, and {ego.engine_name} does not: take crnn")
     if ego.waits_for_end and source.live:
         raise UsageError(
             f"engine {ego.engine_name} needs the whole recording before it answers: give --input FILE or take another"

@@ -20,9 +20,9 @@ class Entry:
     """One engine of the catalogue.
 
     module: its file in this folder, loaded when the engine is asked for and not before: one of them loads onnxruntime.
-    factory: what makes it there, a class or a function. takes: its arguments, the STFT to work with, the path of a
-    network in place of its own, the robot's profile. automatic: whether "auto" may choose it. linear_stage: whether an
-    echo path is adapted before it, that is whether its front is "full".
+    factory: the class or function in that file that makes it. takes: which arguments the factory has of these three: the STFT
+    to work with, the path of a network in place of the engine's own, the robot's profile. automatic: whether "auto" may choose
+    it. linear_stage: whether the adaptive canceller runs before it.
     """
 
     module: str

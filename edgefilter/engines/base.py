@@ -47,7 +47,7 @@ class ClipEngine(Protocol):
     stft: StftConfig
     lookahead: None
     longest: int
-    """Frames that it takes at most; the stream refuses a longer recording."""
+    """The most frames of the STFT that the engine takes; the stream refuses a longer recording."""
 
     def answer(self, frames: Sequence[Frame]) -> Sequence[Spectrum]:
         """The human's spectrum (bins,) for each frame of the recording, of which there is at least one."""

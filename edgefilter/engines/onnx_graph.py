@@ -10,7 +10,7 @@ MOST_FIELDS = 1_000_000
 _ELSEWHERE = "takes its weights from other files, expected them inside"
 _LOOPS = "has graphs within its graph (Loop, If, Scan), expected one that runs straight on"
 _FUNCTIONS = "has functions of its own, expected standard operators alone"
-_FOREIGN = "asks for operators of '{}', expected those of ONNX and of ONNX Runtime"
+_FOREIGN = "has operators of the domain '{}', expected only those of ONNX and of ONNX Runtime"
 # by number each field that holds more of its kind, or that none may hold: what is wrong then
 _TENSOR = {13: _ELSEWHERE, 14: _ELSEWHERE}
 _SPARSE = {1: _TENSOR, 2: _TENSOR}

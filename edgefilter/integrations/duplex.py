@@ -41,7 +41,8 @@ PACE_S, PACE_NEAR = 5.0, 0.01
 """Seconds over which samples are counted, and by how much two counts may differ from one another and from a factor of
 CONFUSED: some callbacks of 20 ms."""
 CONFUSED = (1 / 6, 1 / 3, 1 / 2, 2 / 3, 44.1 / 48, 48 / 44.1, 3 / 2, 2.0, 44.1 / 16, 3.0, 4.0, 6.0)
-"""Factors between the rates of sound cards, telephones and speech, and between one, two and four channels."""
+"""By what factor more samples come than the rate that is said promises, where it is taken for another one (of a sound card, a telephone, a
+recogniser), or two or four channels are taken for one."""
 _LOGGER = logging.getLogger(__name__)
 
 
@@ -303,7 +304,7 @@ class Duplex:
                 self.ego.engine_name,
             )
         elif deaf and not self._deaf:
-            _LOGGER.warning("engine %s detects speech: the human is noticed again", self.ego.engine_name)
+            _LOGGER.warning("engine %s detects speech: from now on the human is noticed again", self.ego.engine_name)
 
     def _paired(self) -> tuple[Samples, Samples]:
         """The samples of the microphone that need not wait, and what was played while they were recorded."""

@@ -43,8 +43,8 @@ class Limits:
     """Of the event loop in which nothing else is done before sound that is ahead has its turn, one client after the other: in five a
     message of 20 ms goes all its way."""
     share: float = 0.5
-    """Of a core's time, what a stream may take at once: whose messages cost more than their sound lasts is ahead of its time
-    as one is that sends too much of it. `crnn` takes 0.1 to 0.3."""
+    """Share of a core that a stream may take. A client whose messages take more of it counts as one that sends sound faster than
+    in real time. `crnn` takes 0.1 to 0.3."""
     patience_s: float = 5.0
     """Timeout for the handshake, the first message and the reading of an answer each."""
     idle_s: float = 60.0

@@ -111,7 +111,7 @@ class CandidatePath:
 
     @property
     def over(self) -> bool:
-        """Whether it had its time."""
+        """Whether the candidate was compared for as long as any is."""
         return not self.stays and len(self.gains_db) >= SCHEDULE.most
 
 

@@ -55,7 +55,7 @@ TERMS = {
         "Held out": "every second half second: no fit has used it, so that an effect that is not there gains nothing."
     },
 }
-"""The page's glossary: terms and their meanings by the section beside which they stand."""
+"""The page's glossary: for each section of the page, the terms that stand beside it and what they mean."""
 
 Choice = tuple[bool, ...]
 

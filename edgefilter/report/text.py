@@ -272,7 +272,7 @@ def heading(finding: Finding) -> str:
 
 
 def chance(finding: Finding) -> str:
-    """Say how often a recording in which nothing is missing shows as much of a finding."""
+    """Say how often a recording of a robot whose profile lacks nothing shows at least as much of this effect."""
     return f"{percent(finding.p_value)} of ordinary recordings show as much by chance"
 
 
@@ -389,7 +389,7 @@ def cells_of(row: Candidate) -> tuple[str, ...]:
 
 
 def proof_line(proof: Proof | None, unproven: str) -> str:
-    """Format the running filter's ERLE without and with the effects, or say why nobody has measured it."""
+    """Format how far the running filter lowers the robot without and with the effects (ERLE, dB), or say why that was not measured."""
     if proof is None:
         return f"proof       none: {unproven}"
     return (

@@ -91,7 +91,8 @@ def cancel(
         played = power(spectra)
         echo = _predicted(weights, spectra)
         lost = ~(echo.square().sum(-1) < LOUDEST**2 * hop)
-        if t % c.UNKNOWN_HOPS == 0 and bool(lost.any()):  # a question to the device, which waits: now and then
+        # the program waits here for the GPU, so this is asked only now and then
+        if t % c.UNKNOWN_HOPS == 0 and bool(lost.any()):
             weights = torch.where(lost[:, None, None], first_weights, weights)
             covariance = torch.where(lost[:, None, None], first_covariance, covariance)
         echo = torch.where(lost[:, None], 0.0, echo)

@@ -215,7 +215,7 @@ class _Batch:
             at += said.numel() + int(rng.uniform(*pause_s) * SAMPLE_RATE)
 
     def robot(self, response: Tensor) -> tuple[Tensor, Tensor]:
-        """What the player is told, and its echo through that response, (count, n) each."""
+        """The references, and their echoes through this response, (count, n) each."""
         told, rng = torch.zeros(self.count, self.n, device=self.device), self.rng
         talks, person, other = (self.happens(share) for share in ("robot", "far_human", "other_voices"))
         for row in np.flatnonzero(talks):

@@ -123,7 +123,7 @@ class Sounds:
 
 
 def read(folder: Path, split: str, device: torch.device) -> Sounds:
-    """What the unpacked archive holds for "train" or "val"."""
+    """Read the sounds of one split, "train" or "val", from the folder of the unpacked archive."""
     humans, robots = (_voices(read_corpus(folder / who / split), device) for who in ("human", "robot"))
     noises = read_noises(folder / "noise") if (folder / "noise").is_dir() else ()
     responses = read_responses(folder / "rir") if (folder / "rir").is_dir() else {}

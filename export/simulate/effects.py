@@ -14,7 +14,7 @@ from edgefilter.types import SAMPLE_RATE, Array
 PATH_CHANGE = 0.3
 """Share of wide items in which the path changes on the way."""
 LOST_MORE = 2.0
-"""Times as many packets are lost at most as in the recording in which that was found, and so many times fewer at least."""
+"""Factor between the share of packets that a made recording loses and the share that the measured recording lost: from 1/2 to 2."""
 Found = tuple[tuple[str, Values], ...]
 """Effects by name, with their values."""
 

@@ -70,7 +70,7 @@ def draw_colour(rng: np.random.Generator) -> Samples:
 
 
 def path(room: Samples, colour: Samples) -> Samples:
-    """The echo path, its direct sound at PRE_ROLL, at most half a second."""
+    """The echo path: the room convolved with colour, the loudspeaker's response; direct sound at sample PRE_ROLL, half a second at most."""
     response = signal.oaconvolve(room, colour)
     start = max(0, int(np.argmax(np.abs(response))) - PRE_ROLL)
     missing = max(0, PRE_ROLL - int(np.argmax(np.abs(response))))

@@ -107,7 +107,7 @@ WIDE = Recipe(
     distortion_db=(-45.0, -10.0),  # real loudspeakers leave -16 to -24 dB after the best linear filter
     wideness=1.0,
     catalogue=0.3,
-    later=0.15,  # what a robot hears after its first seconds; each costs ten times the simulation
+    later=0.15,  # what a robot hears after the first seconds of a run; such an item takes ten times as long to simulate
     setting=WideSetting(),
     plain=0.3,  # what the benchmark measures must stay in the training
 )

@@ -383,7 +383,7 @@ def test_a_channel_that_is_not_there_is_one_line(tmp_path):
     soundfile.write(tmp_path / "two.wav", np.zeros((100, 2)), 16000)
     with pytest.raises(AudioFileError, match="has 2 channels, 0 to 1, found channel 2 asked for"):
         FileSource(tmp_path / "two.wav", channels=Channels([0, 2]))
-    with pytest.raises(UsageError, match="stereo, microphone and reference, found channels asked for"):
+    with pytest.raises(UsageError, match="stereo, microphone and reference, so its channels cannot be named"):
         open_source("-", channels=Channels([0]))
 
 

@@ -134,11 +134,11 @@ CHANGES = {
     ),
     "operator of a library": (
         lambda m: setattr(m.graph.node[0], "domain", "com.example.run_my_code"),
-        "asks for operators of .com.example.run_my_code",
+        "has operators of the domain .com.example.run_my_code",
     ),
     "library of many lines": (  # found by random damage
         lambda m: setattr(m.graph.node[0], "domain", "\n\x0bhidden\x18"),
-        r"asks for operators of . hidden\\x18.",
+        r"has operators of the domain . hidden\\x18.",
     ),
     "weights that are no numbers": (weights_that_are_no_numbers, "answers with values that are not finite"),
     "state beyond all memory": (says("states", json.dumps([["state_0", [1, 2**40]]])), "unusable metadata .*state_0"),
@@ -178,7 +178,7 @@ FUNCTION = onnx.helper.make_function("", "F", [], [], [], []).SerializeToString(
         (varint(25 << 3 | 2, 5) + varint(len(FUNCTION), 5) + FUNCTION, "functions of its own"),
         (varint(1 << 32 | 25 << 3 | 2) + varint(len(FUNCTION)) + FUNCTION, "cannot be loaded .field 536870937"),
         (varint(7 << 3 | 2) + varint(4) + b"\x0a\x02\x3a\x00", "takes no part"),
-        (varint(7 << 3 | 2) + varint(5) + b"\x0a\x03\x3a\x01x", "operators of 'x'"),
+        (varint(7 << 3 | 2) + varint(5) + b"\x0a\x03\x3a\x01x", "operators of the domain 'x'"),
         (varint(99 << 3 | 3) + varint(99 << 3 | 4), "cannot be loaded .field 99 .wire type 3."),
         (varint(99 << 3 | 2) + varint(1 << 40), "cannot be loaded .field 99 .wire type 2. says 1099511627776 bytes"),
         (varint(99 << 3) + b"\xff" * 10, "a number that does not end"),
