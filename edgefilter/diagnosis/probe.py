@@ -168,6 +168,7 @@ class Inquiry:
                 kept.append(Explanation(effects, model.lasting(), error))
                 voices.append(heard)
         self.explanations = tuple(kept)
+        self._expected: dict[tuple[str, frozenset[int]], dict[int, dict[int, float]] | None] = {}
 
     def before(self) -> Array:
         """The probability of each, and of none, by the other half, before anything is asked, (explanations + 1,)."""
@@ -218,24 +219,42 @@ class Inquiry:
         """
         likely = likely[: len(self.explanations)]
         standing = max(int(np.count_nonzero(likely * ENOUGH >= likely.max())), 2)
-        asked = [self.explanations[i] for i in np.argsort(-likely)[:standing]]
+        asked = np.argsort(-likely)[:standing].tolist()
         found, most = [], 0.0
         for words, sound in menu(self.reference).items():
             if progress:
                 progress(f"trying {words}")
-            try:
-                heard = [prepare(self.profile, _simulated(self.profile, one, sound), sound) for one in asked]
-            except SignalError:  # in what is recorded of it nobody would find it
+            told = self._told(words, sound, frozenset(asked))
+            if told is None:
                 continue
-            told = [np.sum([_log_likelihood(h, asked).sum(axis=0) for h in _halves(x)], axis=0) for x in heard]
-            gains = [max(float(told[i][i] - told[i][j]), 0.0) for i, j in permutations(range(len(asked)), 2)]
+            gains = [max(float(told[i][i] - told[i][j]), 0.0) for i, j in permutations(asked, 2)]
             found.append(Sound(words, sound, float(np.mean(np.log1p(gains)))))
             most = max(most, *gains)
         found.sort(key=lambda sound: -sound.expected)
         if most < np.log(ENOUGH):
-            names = " and ".join(one.name for one in asked)
+            names = " and ".join(self.explanations[i].name for i in asked)
             raise SignalError(f"no sound tells {names} apart: as fitted they predict the same; record in another place")
         return found
+
+    def _told(self, words: str, sound: Samples, asked: frozenset[int]) -> dict[int, dict[int, float]] | None:
+        """By the number of each explanation asked, were it true: the log likelihood of each after that sound of the menu.
+
+        None where the sound would not be found again. Nothing of that changes with what is heard, so it is kept.
+        """
+        known = words, asked
+        if known not in self._expected:
+            numbers = sorted(asked)
+            them = [self.explanations[i] for i in numbers]
+            try:
+                heard = [prepare(self.profile, _simulated(self.profile, one, sound), sound) for one in them]
+            except SignalError:  # in what is recorded of it nobody would find it
+                self._expected[known] = None
+            else:
+                told = (np.sum([_log_likelihood(h, them).sum(axis=0) for h in _halves(x)], axis=0) for x in heard)
+                self._expected[known] = {
+                    i: dict(zip(numbers, row.tolist())) for i, row in zip(numbers, told, strict=True)
+                }
+        return self._expected[known]
 
     def ask(
         self, play: Callable[[Sound], Samples], seconds: float, progress: Callable[[str], None] | None = None
