@@ -317,9 +317,11 @@ def tests(copy: Path, chosen: Sequence[str], limit_s: float | None, *options: st
     """The exit code of the first chosen tests that fail, or of all; slow ones last."""
     began = time.monotonic()
     environment = os.environ | {"PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
+    # the tests need no plugin, hypothesis works without its own; to load them takes a processor up to 2 s at each start
+    environment["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
+    plugins = "-p pytest_cov" if options else ""
     for which in ("not slow", "slow"):
-        # hypothesis works without its plugin, which takes 2 s of a processor at each start
-        pytest = "-m pytest --rootdir=. -x -q -p no:cacheprovider -p no:hypothesispytest -m".split()
+        pytest = f"-m pytest --rootdir=. -x -q -p no:cacheprovider {plugins} -m".split()
         left = None if limit_s is None else max(limit_s - (time.monotonic() - began), 1.0)
         command, quiet = [sys.executable, *pytest, which, *options, *chosen], subprocess.DEVNULL
         process = subprocess.Popen(
