@@ -4,41 +4,23 @@ import asyncio
 
 import numpy as np
 import pytest
-from livekit import rtc
-from livekit.agents import stt
-from livekit.agents.voice import io, room_io
 
 from edgefilter import EgoFilter, UsageError
 from edgefilter.integrations.duplex import as_pcm16, from_pcm16
-from edgefilter.integrations.livekit import EgoProcessor
 
 NOISE = 0.1 * np.random.default_rng(0).standard_normal(48_000).astype(np.float32)
 
 
-class Sink(io.AudioOutput):
-    """The end of an output's chain, which writes down what it was asked for."""
+@pytest.fixture(scope="module", autouse=True)
+def livekit():
+    """It takes three seconds to load: the process that runs these tests does it, not each that collects them."""
+    global rtc, stt, room_io, EgoProcessor, Recogniser, Sink
+    from livekit import rtc
+    from livekit.agents import stt
+    from livekit.agents.voice import room_io
 
-    def __init__(self):
-        super().__init__(label="sink", capabilities=io.AudioOutputCapabilities(pause=True), sample_rate=24_000)
-        self.asked, self.heard = [], []
-
-    async def capture_frame(self, frame):
-        await super().capture_frame(frame)
-        self.heard.append(from_pcm16(frame.data.cast("B")))
-        self.asked.append(frame.samples_per_channel)
-
-    def flush(self):
-        super().flush()
-        self.asked.append("flush")
-
-    def clear_buffer(self):
-        self.asked.append("clear")
-
-    def pause(self):
-        self.asked.append("pause")
-
-    def resume(self):
-        self.asked.append("resume")
+    from edgefilter.integrations.livekit import EgoProcessor
+    from tests.integrations.livekit_ends import Recogniser, Sink
 
 
 @pytest.fixture
@@ -136,19 +118,6 @@ def test_switched_off_it_gives_the_microphone_as_it_is(ears):
     ears.enabled = False
     assert not ears.enabled
     np.testing.assert_array_equal(through(ears, frame_of(NOISE[:1200])).data, frame_of(NOISE[:1200]).data)
-
-
-class Recogniser(stt.STT):
-    """Keeps what it is to transcribe."""
-
-    def __init__(self):
-        super().__init__(capabilities=stt.STTCapabilities(streaming=False, interim_results=False))
-        self.segments = []
-
-    async def _recognize_impl(self, buffer, *, language, conn_options):
-        self.segments.append(rtc.combine_audio_frames(buffer))
-        words = [stt.SpeechData(language="en", text="words")]
-        return stt.SpeechEvent(stt.SpeechEventType.FINAL_TRANSCRIPT, alternatives=words)
 
 
 @pytest.mark.parametrize("enabled", [True, False])
