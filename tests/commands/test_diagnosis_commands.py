@@ -123,9 +123,9 @@ def test_add_says_what_the_running_filter_makes_of_an_effect_where_that_is_nothi
     assert "follows the clocks by itself" in said and f"NOTE        clock_drift: {said}" in capsys.readouterr().out
 
 
-def test_diagnose_finds_what_is_missing_and_writes_the_documented_json(scene, capsys):
-    assert main(arguments(scene, "diagnose", "--json", "-")) == 0
-    found = printed_json(capsys)
+def test_diagnose_finds_what_is_missing_and_writes_the_documented_json(scene, tmp_path, capsys):
+    assert main(arguments(scene, "diagnose", "--json", tmp_path / "d.json")) == 0
+    found, out = json.loads((tmp_path / "d.json").read_text()), capsys.readouterr().out
     assert found["verdict"] == "missing" and [entry["effect"] for entry in found["ranking"]] == ["playback_gain"]
     assert found["ranking"][0]["parameters"]["gain_db"]["value"] == pytest.approx(
         -3.0, abs=0.02
@@ -142,8 +142,6 @@ def test_diagnose_finds_what_is_missing_and_writes_the_documented_json(scene, ca
         "where",
     } <= set(found)
     assert set(found["where"]) == {"bands", "times", "levels", "lags"}
-    assert main(arguments(scene, "diagnose")) == 0
-    out = capsys.readouterr().out
     assert "verdict     missing: The recording differs from the profile by a turned volume." in out
     assert out.splitlines()[-1].startswith("next        edgefilter add playback_gain --profile ")
     assert len(out.splitlines()) <= 10 and "by frequency" not in out
