@@ -2,7 +2,6 @@
 
 import json
 import re
-import subprocess
 
 import numpy as np
 import pytest
@@ -12,17 +11,13 @@ from edgefilter.cli import main
 from edgefilter.commands import demo as command
 from edgefilter.commands.outputs import HIDDEN_FILES
 from edgefilter.filter.ego_filter import EgoFilter
-from tests.program import argv
+from tests.program import here
 
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo")
-    result = subprocess.run(
-        argv("demo", "--output", folder, "--json", folder / "demo.json"),
-        capture_output=True,
-        text=True,
-    )
+    result = here("demo", "--output", folder, "--json", folder / "demo.json")
     assert result.returncode == 0, result.stderr
     return folder, result.stdout
 
