@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edgefilter.alignment.belief import LOOK, Belief, believed
+from edgefilter.alignment.belief import LOOK, REACH, Belief, believed
 from edgefilter.alignment.coarse_lag import CoarseLag
 from edgefilter.alignment.delay_line import HALF_WIDTH, WAIT, DelayBuffer, kernel_table, read_delayed, read_line
 from edgefilter.alignment.delay_tracker import DRIFTED, FAINT, SIZE, STRIDE, DelayMeasurement, DelayMeter, DriftFilter
@@ -88,8 +88,7 @@ class Aligner:
 
     A new utterance is looked for over all lags; the old delay holds until it is confirmed or replaced, but where the
     microphone is far too quiet for it, nothing is delivered. Between utterances delay and drift are carried on. hop:
-    samples per step. profile: its impulse responses tell the shape of the arrival. max_lag_s: of the playback, seconds.
-    Of a calibrated array all microphones are searched together, and the delay is measured in the first that is used.
+    samples per step. profile: its impulse responses tell the shape of the arrival. Of a calibrated array all microphones are searched together, and the delay is measured in the first that is used.
 
     >>> rng = np.random.default_rng(0)
     >>> voice = rng.standard_normal(16384).astype(np.float32) / 10
@@ -101,33 +100,18 @@ class Aligner:
     ('locked', 2000)
     """
 
-    def __init__(self, hop: int, profile: Profile | None = None, max_lag_s: float = MOST_LAG_S) -> None:
+    def __init__(self, hop: int, profile: Profile | None = None) -> None:
         self.hop = hop
-        self._max_lag = int(max_lag_s * SAMPLE_RATE)
         # samples from the beginning of an utterance until it is heard, most likely and at most
-        self._likely, self._latest = (int((s + 0.35) * SAMPLE_RATE) for s in (min(max_lag_s, LIKELY_LAG_S), max_lag_s))
+        self._likely, self._latest = (int((s + 0.35) * SAMPLE_RATE) for s in (LIKELY_LAG_S, MOST_LAG_S))
         self._calibrated = None if profile is None else list(profile.running_responses())
         self._first = FirstSounds(hop, self._calibrated[0] if self._calibrated else None)
         kernel_table()
-        self.reset()
-
-    def _listen_for(self, responses: Sequence[Samples] | None) -> None:
-        """What an arrival looks like from now on: the microphones' impulse responses (taps,); None: anything."""
-        self._responses = responses
-        self._lags = LagSearch(self._max_lag, responses or (), LATE, (FURTHEST, LATEST, LATEST + LOOK))
-        self._meter = self._new_meter()
-
-    def _new_meter(self) -> DelayMeter:
-        return DelayMeter(None if self._responses is None else self._responses[self._used[0]])
-
-    def reset(self) -> None:
-        """Forget everything, as after construction."""
         self._used = [0]
-        self._first.reset()
         self._listen_for(self._calibrated)
         self._ref = DelayBuffer(self._lags.span + SAMPLE_RATE)
         self._mics = [DelayBuffer(self._ref.capacity)]
-        self._onsets = OnsetDetector(self.hop)
+        self._onsets = OnsetDetector(hop)
         self._drift = DriftFilter()
         self._open: deque[Utterance] = deque(maxlen=32)
         self._announced = Announcements()
@@ -140,13 +124,22 @@ class Aligner:
         self._read_at, self._wait = float("nan"), 0
         self._to_search, self._to_measure = SEARCH_STRIDE, STRIDE // 2
         self._gain: float | None = None
-        self._by_bands = None if self._calibrated else CoarseLag(self.hop, self._max_lag)
+        self._by_bands = None if self._calibrated else CoarseLag(hop, REACH)
         self._margin = PRE_ROLL
         self._log_odds = 0.0  # of the delay; below 0 also where none is known and an utterance was not heard
         self._lost = 0  # measurements in a row that have not seen the robot
         self._counts = AlignmentCounts(
             utterances=0, realignments=0, jumps=0, searches=0, announced=0, announced_heard=0
         )
+
+    def _listen_for(self, responses: Sequence[Samples] | None) -> None:
+        """What an arrival looks like from now on: the microphones' impulse responses (taps,); None: anything."""
+        self._responses = responses
+        self._lags = LagSearch(REACH, responses or (), LATE, (FURTHEST, LATEST, LATEST + LOOK))
+        self._meter = self._new_meter()
+
+    def _new_meter(self) -> DelayMeter:
+        return DelayMeter(None if self._responses is None else self._responses[self._used[0]])
 
     def hear_by(self, used: Sequence[int]) -> None:
         """Use these microphones of an array from now on; the delay stays, since their calibrated paths share one time origin."""
@@ -304,7 +297,7 @@ class Aligner:
 
     def _audible(self) -> bool:
         """Whether the microphone may still hear some of the reference, which takes the lag and its reverberation to fade."""
-        reach = self._max_lag if not self._known else max(int(self._drift.delay), 0) + SAMPLE_RATE // 4
+        reach = REACH if not self._known else max(int(self._drift.delay), 0) + SAMPLE_RATE // 4
         return self._onsets.current.end + reach >= self._ref.end
 
     def _expire(self) -> None:
@@ -351,7 +344,7 @@ class Aligner:
             self._seen = found
         # so that the next search uses sound that this one has not used
         self._looked = self._ref.end + min(found.lag, 0)
-        sure = -WAIT <= found.lag <= self._max_lag and self._certain(found)
+        sure = -WAIT <= found.lag <= REACH and self._certain(found)
         yield sure and bool(self._open) and not self._known and self._take(found)
 
     def _look_for_utterance(self) -> Iterator[bool]:

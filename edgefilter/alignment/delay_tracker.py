@@ -23,7 +23,7 @@ STRIDE = 1024
 """Samples between two measurements."""
 REACH = 1024
 """Largest jump that the tracker sees, samples; beyond it the whole range is searched."""
-SIZE = FRAME + 2 * REACH
+SIZE = REACH + FRAME + REACH
 EARLY = (48, 400)
 """Samples before and after the direct sound that the learnt response keeps."""
 SMALL = 8.0

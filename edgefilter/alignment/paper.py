@@ -17,8 +17,7 @@ TEMPLATE = SAMPLE_RATE // 2
 STRIDE = 2048
 """Lags that are evaluated at a time."""
 DECISIVE = 0.35
-"""Normalised correlation above which the lag is taken at once: chance peaks of speech against other speech stay under
-0.3."""
+"""Normalised correlation above which the lag is taken at once: chance peaks of speech against other speech stay under 0.3."""
 CREDIBLE = 0.1
 """Normalised correlation under which the utterance was not heard, and the last lag is kept."""
 
@@ -31,17 +30,13 @@ class PaperAligner:
     2024, section on alignment).
     """
 
-    def __init__(self, hop: int, max_lag_s: float = 1.5) -> None:
+    def __init__(self, hop: int) -> None:
         self.hop = hop
-        self._max_lag = int((max_lag_s + 0.1) * SAMPLE_RATE)
+        self._max_lag = int(1.6 * SAMPLE_RATE)
         self._size = fft.next_fast_len(TEMPLATE + STRIDE, real=True)
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget everything."""
         length = self._max_lag + TEMPLATE + 4 * SAMPLE_RATE
         self._mic, self._ref = DelayBuffer(length), DelayBuffer(length)
-        self._onsets = OnsetDetector(self.hop)
+        self._onsets = OnsetDetector(hop)
         self._waiting: deque[int] = deque(maxlen=16)
         self._delay: int | None = None
         self._confidence = 0.0
@@ -61,12 +56,9 @@ class PaperAligner:
             self._waiting.append(max(started.start, 0))
         before = self._delay
         self._search()
-        delay, now = self._delay, self._ref.end
-        state: AlignmentState = "begun" if self._onset is not None else "idle" if delay is None else "locked"
-        if delay is None:
-            return Aligned(np.zeros(self.hop, np.float32), float("nan"), 0.0, self._confidence, state, False)
-        out = self._ref.read(now - self.hop - delay, now - delay).copy()
-        return Aligned(out, float(delay), 0.0, self._confidence, state, delay != before)
+        state: AlignmentState = "begun" if self._onset is not None else "idle" if self._delay is None else "locked"
+        delay, moved = float("nan") if self._delay is None else float(self._delay), self._delay != before
+        return Aligned(self.history(self.hop), delay, 0.0, self._confidence, state, moved)
 
     def history(self, count: int) -> Samples:
         """The last count aligned samples under the present delay, (count,) float32."""

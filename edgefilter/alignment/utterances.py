@@ -200,12 +200,8 @@ class FirstSounds:
 
     def __init__(self, hop: int, response: Samples | None) -> None:
         self._hop = hop
-        self._calibrated = math.inf if response is None else float(np.sum(np.square(response)))
-        self.reset()
-
-    def reset(self) -> None:
-        """As before the first hop."""
-        self._gain, self._heard, self._since, self._before = self._calibrated, False, 0, 0
+        self._gain = math.inf if response is None else float(np.sum(np.square(response)))
+        self._heard, self._since, self._before = False, 0, 0
 
     def step(self, mic: Samples, explained: Samples, loudest: float, state: AlignmentState, waits: bool) -> bool:
         """Take a hop; whether its sound is the robot at another delay.

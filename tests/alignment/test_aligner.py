@@ -398,7 +398,7 @@ def test_delivered_reference_and_history_are_the_delayed_reference(hop):
     assert np.sqrt(np.mean((history - recent) ** 2)) < 0.02 * scale  # both read the same line
 
 
-def test_announcing_what_the_reference_carries_changes_nothing_and_reset_starts_anew():
+def test_announcing_what_the_reference_carries_changes_nothing():
     rng = np.random.default_rng(6)
     ref, _ = utterances(rng, [2], [0.5])
     mic, truth = hear(ref, [(0, 2000)], room(rng, 0.3))
@@ -408,10 +408,8 @@ def test_announcing_what_the_reference_carries_changes_nothing_and_reset_starts_
     aligner = Aligner(256)
     aligner.announce(ref)
     told = run(aligner, mic, ref)
-    aligner.reset()
-    again = run(aligner, mic, ref)
-    for one, two, three in zip(plain, told, again, strict=True):
-        assert np.array_equal(one.reference, two.reference) and np.array_equal(one.reference, three.reference)
+    for one, two in zip(plain, told, strict=True):
+        assert np.array_equal(one.reference, two.reference)
     assert (
         aligner.stats()["state"] in ("locked", "idle") and abs(aligner.stats()["delay_samples"] - truth[-1]) < 0.1
     )  # the jitter of a locked delay is far below
