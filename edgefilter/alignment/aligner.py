@@ -88,7 +88,8 @@ class Aligner:
 
     A new utterance is looked for over all lags; the old delay holds until it is confirmed or replaced, but where the
     microphone is far too quiet for it, nothing is delivered. Between utterances delay and drift are carried on. hop:
-    samples per step. profile: its impulse responses tell the shape of the arrival. Of a calibrated array all microphones are searched together, and the delay is measured in the first that is used.
+    samples per step. profile: its impulse responses tell the shape of the arrival.
+    Of a calibrated array all microphones are searched together, and the delay is measured in the first that is used.
 
     >>> rng = np.random.default_rng(0)
     >>> voice = rng.standard_normal(16384).astype(np.float32) / 10

@@ -9,8 +9,6 @@ from edgefilter.types import Array, Samples
 
 SILENT = 10**-4.5
 """Power, 45 dB under the loudest of a voice, under which it is silent."""
-
-
 DB_PER_NEPER = 20.0 / np.log(10.0)
 
 

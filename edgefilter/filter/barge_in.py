@@ -108,7 +108,7 @@ class OwnVoice:
     """
 
     def __init__(self, hop_s: float, before: WhileMoving | None = None) -> None:
-        self._hop_s, self._memory, self._usual = hop_s, LEARNED_S / hop_s, LEARNED_S / USUAL_S
+        self._hop_s, self._memory = hop_s, LEARNED_S / hop_s
         self._even = self._apart = round(BargeInSettings.confirm_s / hop_s)
         self._open = self._suspected = False
         self._peaks, self._hops = (before.moments, before.seconds / hop_s) if before else (0.0, 0.0)
@@ -116,7 +116,7 @@ class OwnVoice:
     @property
     def higher(self) -> float:
         """By how much this robot raises the threshold, log-odds, so that its own voice causes no more false suspicions than a usual robot's."""
-        return FALL * math.log((1.0 + self._peaks / self._usual) / (1.0 + self._hops / self._memory))
+        return FALL * math.log((1.0 + self._peaks / (LEARNED_S / USUAL_S)) / (1.0 + self._hops / self._memory))
 
     @property
     def counted(self) -> tuple[float, float]:

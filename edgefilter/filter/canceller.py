@@ -209,8 +209,7 @@ class Canceller:
         self._padded = np.zeros((*lead, 2 * hop), np.float32)
         self._shelves = ShelfStates()
         self._hops = self._active = 0
-        self.volume = Volume(hop, "unscaled" if warm else "unknown")
-        self.volume.gain = self._initial_gain
+        self.volume = Volume(hop, "unscaled" if warm else "unknown", self._initial_gain)
         self._limiter = EchoLimiter(hop)
 
     def step(self, mic: Samples, reference: Samples, located: bool = True) -> CancellerOutput:
@@ -402,8 +401,7 @@ class Canceller:
         canceller._ageing = (1.0 - state.adaptation.transition**2) * fourier.power(canceller._weights)
         canceller._unknown = 0 if canceller._covariance.any() else UNKNOWN_HOPS
         canceller._initial, canceller._initial_gain = canceller.impulse_response(), state.volume_gain
-        canceller.volume = Volume(hop)
-        canceller.volume.gain = state.volume_gain
+        canceller.volume = Volume(hop, gain=state.volume_gain)
         return canceller
 
     def rewrite_reference(self, history: Samples) -> None:

@@ -120,16 +120,12 @@ class Learner(Protocol):
 
     def start(self, path: PathState, hop: int) -> None:
         """A stream begins with that path, in steps of hop samples."""
-        ...
 
     def observe(self, hop: FilteredHop) -> PathUpdate | None:
         """Take one hop; the update is adopted with the next one."""
-        ...
 
     def stats(self) -> dict[str, object]:
         """What was learned so far, ready for JSON."""
-        ...
 
     def close(self) -> None:
         """The stream is over."""
-        ...

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
+from edgefilter.alignment.coarse_lag import RANGE
 from edgefilter.dsp import fourier
 from edgefilter.dsp.frames import frames
 from edgefilter.dsp.psd import hann
@@ -24,9 +25,8 @@ the highest 1 % reach .34, the highest of all .56. Of 22 real recordings played 
 FRAME, HOP = 2048, 512
 BINS_HZ = 200.0 * np.exp(STEP * np.arange(340))
 """Up to 6 kHz."""
-FORMANTS, RANGE = 30, 1e-5
-"""Bins of the moving mean that is subtracted from the logarithm of a spectrum, so that harmonics are left; power of the floor, relative
-to the loudest bin."""
+FORMANTS = 30
+"""Bins of the moving mean that is subtracted from the logarithm of a spectrum, so that harmonics are left."""
 ASIDE = 8
 """Frames of lag on each side of the best score that belong to the same peak. Of speeds three do, since a harmonic is 3 % wide."""
 

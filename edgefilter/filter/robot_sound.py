@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from edgefilter.alignment.coarse_lag import BANDS
+from edgefilter.dsp.lag import LOWEST_HZ
 from edgefilter.dsp.psd import mel_edges
 from edgefilter.filter.volume import AUDIBLE
 from edgefilter.types import SAMPLE_RATE, Samples
 
-BANDS, LOWEST_HZ = 40, 100.0
-"""Half as wide as the ear's bands (mel), and where the lowest begins. With 20 bands 25 times as many humans pass."""
 HEARD_S = 4.0
 """Seconds of robot from which on its sound is known, and of another sound that are compared with it."""
 MEMORY_S = 20.0
@@ -29,6 +29,7 @@ class RobotSound:
     """
 
     def __init__(self, hop: int, bins: int) -> None:
+        # bands half as wide as the ear's; with 20, as wide as those, 25 times as many humans pass
         self._edges = mel_edges(bins, BANDS, LOWEST_HZ)
         self._enough, self._most = (round(s * SAMPLE_RATE / hop) for s in (HEARD_S, MEMORY_S))
         self._robot = np.zeros(self._edges.size)

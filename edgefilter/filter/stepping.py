@@ -46,7 +46,6 @@ class Stepping:
         self.missed = self.over_budget = self.steps = 0
         self.behind_ms = self.most_behind_ms = 0.0
         self._recent: deque[bool] = deque(maxlen=self._window)
-        self._late = 0
         self._calm_hops = self._calm_late = 0
         self._patience_s = PATIENCE_S
         self._since_up: int | None = None
@@ -63,13 +62,12 @@ class Stepping:
         self.over_budget += late
         self.behind_ms = max(0.0, self.behind_ms + ms - self.hop_ms)
         self.most_behind_ms = max(self.most_behind_ms, self.behind_ms)
-        self._late += late - (self._recent[0] if len(self._recent) == self._window else 0)
         self._recent.append(late)
         self._calm_hops += 1
         self._calm_late += late
         if self._since_up is not None:
             self._since_up += 1
-        if self._late >= OVERLOADED * self._window:
+        if sum(self._recent) >= OVERLOADED * self._window:
             return self._down()
         return self._up()
 
@@ -90,9 +88,8 @@ class Stepping:
         return round(1000 * seconds / self.hop_ms)
 
     def _down(self) -> tuple[EventKind, str] | None:
-        why = f"{self._late} of the last {len(self._recent)} hops took more than {self.budget_ms:.1f} ms"
+        why = f"{sum(self._recent)} of the last {len(self._recent)} hops took more than {self.budget_ms:.1f} ms"
         self._recent.clear()
-        self._late = 0
         self._calm_hops = self._calm_late = 0
         if self.fallback is None or self.fallback.wanted == len(self.fallback.engines) - 1:
             first, self._told = not self._told, True

@@ -15,13 +15,7 @@ from edgefilter.dsp.stft import Synthesiser
 from edgefilter.engines.base import ClipEngine, Engine, EngineState
 from edgefilter.engines.spectral_subtraction import FLOOR
 from edgefilter.errors import SignalError
-from edgefilter.filter.barge_in import (
-    INTERRUPTIONS,
-    SUSPICIONS,
-    BargeIn,
-    BargeInSettings,
-    human_probability,
-)
+from edgefilter.filter.barge_in import INTERRUPTIONS, SUSPICIONS, BargeIn, BargeInSettings, human_probability
 from edgefilter.filter.echo_path import Learner
 from edgefilter.filter.front_end import FrontEnd
 from edgefilter.filter.reference_watch import ReferenceWatch

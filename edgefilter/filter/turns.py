@@ -26,66 +26,50 @@ class Turns:
     """Keeps the latest frames of one stream; step once a frame.
 
     stft: of the frames. spatial: of an array; with one microphone a second look finds nothing new, and the turn is what
-    was streamed. What is kept are the errors (microphones, bins) and the engine's answer over the error, so that another
-    spatial filter costs no second run of the engine.
+    was streamed. Of an array's frame the errors and the engine's answer over the error are kept, (microphones + 1, bins), so that
+    another spatial filter costs no second run of the engine, else the answer, (1, bins).
     """
 
     def __init__(self, stft: StftConfig, spatial: SpatialFilter | None) -> None:
         self._stft, self._spatial = stft, spatial
         self._before = round(BEFORE_S * SAMPLE_RATE / stft.hop)
-        self._room = round(LONGEST_S * SAMPLE_RATE / stft.hop)
-        microphones = 1 if spatial is None else len(spatial.weights)
-        self._errors = np.zeros((0, microphones, stft.bins), np.complex64)
-        self._gains = np.zeros((0, stft.bins), np.complex64)
+        self._frames: deque[Spectrum] = deque(maxlen=round(LONGEST_S * SAMPLE_RATE / stft.hop))
         self._count = self._begin = 0
 
     def step(self, answer: Spectrum, error: Spectrum, errors: Spectrum | None) -> None:
         """Keep a frame: the engine's output and the error it was given, (bins,); errors of all microphones, (microphones, bins), of an array."""
-        at = self._count % self._room
-        if at >= len(self._gains):
-            self._grow()
-        if errors is None:
-            self._errors[at, 0], self._gains[at] = answer, 1.0
-        else:
-            self._errors[at] = errors
+        frame: list[np.ndarray] = [answer]
+        if errors is not None:
             gain = np.divide(answer, error, out=np.zeros_like(answer), where=error != 0.0)
             # an engine's output is no louder than its input, but where that is all but zero their ratio may say so
-            self._gains[at] = gain / np.maximum(np.abs(gain), 1.0)
+            frame = [*errors, gain / np.maximum(np.abs(gain), 1.0)]
+        self._frames.append(np.array(frame, np.complex64))
         self._count += 1
 
     def start(self, waited: int = 0) -> None:
         """A turn has begun so many frames before the latest."""
-        self._begin = max(self._count - 1 - waited - self._before, 0)
+        self._begin = self._count - 1 - waited - self._before
 
     def finish(self) -> Turn:
         """The turn up to the latest frame, a whole number of hops."""
-        return self._since(max(self._begin, self._count - self._room))
+        return self._since(self._begin)
 
     def recent(self, waited: int = 0) -> Turn:
         """From RECENT_S, or a hop more, before the frame that came so many frames before the latest, to that."""
         frames = -(-round(RECENT_S * SAMPLE_RATE) // self._stft.hop) + 1 + waited  # the latest ends with half a window
-        return self._since(max(self._count - frames, 0))
+        return self._since(self._count - frames)
 
     def _since(self, first: int) -> Turn:
-        """The frames from the first to the latest."""
-        rows = np.arange(first, self._count) % self._room
-        errors, gains = self._errors[rows], self._gains[rows]
-        if self._spatial is None:
-            spectra = errors[:, 0]
-        else:
-            spectra = sum(weight.conj() * errors[:, at] for at, weight in enumerate(self._spatial.finished())) * gains
+        """The frames from the first, or the first that is kept, to the latest."""
+        first = max(first, self._count - len(self._frames))
+        kept = np.stack(list(self._frames)[first - self._count :])
+        spectra = kept[:, 0]
+        if self._spatial is not None:
+            weights = self._spatial.finished()
+            spectra = sum(weight.conj() * kept[:, at] for at, weight in enumerate(weights)) * kept[:, -1]
         late = self._stft.window_length - self._stft.hop
         # frame t ends with sample (t + 1) hop; the first `late` samples lack the frame before, the last `late` the one after
         return Turn(first * self._stft.hop, overlap_add(spectra, self._stft)[late : -late or None])
-
-    def _grow(self) -> None:
-        """Room for twice as many frames, and for a second at first: most streams never need all of it."""
-        rows = min(max(2 * len(self._gains), SAMPLE_RATE // self._stft.hop), self._room)
-        for name in ("_errors", "_gains"):
-            before = getattr(self, name)
-            after = np.zeros((rows, *before.shape[1:]), np.complex64)
-            after[: len(before)] = before
-            setattr(self, name, after)
 
 
 def drop_sound(events: deque[Event]) -> None:

@@ -62,10 +62,6 @@ class Moments(NamedTuple):
         """The sums of both."""
         return Moments(*(before + new for before, new in zip(self, now)))
 
-    def scaled(self, factor: float) -> Moments:
-        """Those of an echo that is factor times this one."""
-        return Moments(self.mic, self.cross * factor, self.echo * factor**2)
-
     def left(self, factor: float = 1.0) -> float:
         """Power of mic - factor * echo."""
         return self.mic - 2.0 * self.cross * factor + self.echo * factor * factor
@@ -78,14 +74,14 @@ class Volume:
     and reference is found first, hop by hop; "tried" while a factor is. gain: product of all factors so far.
     """
 
-    def __init__(self, hop: int, path: Literal["known", "unknown", "unscaled"] = "known") -> None:
+    def __init__(self, hop: int, path: Literal["known", "unknown", "unscaled"] = "known", gain: float = 1.0) -> None:
         self._forget = 0.1 ** (hop / (FORGET_S * SAMPLE_RATE))
         self._patience = round(PATIENCE_S * SAMPLE_RATE / hop)
         self._path: Literal["known", "unknown", "unscaled", "tried"] = path
         self._peak = 0.0
         self._smoothed = self._since = Moments()
         self._factor, self._count, self._age, self._rest = 1.0, 0, 0, 0
-        self.gain = self._first = 1.0
+        self.gain, self._first = gain, 1.0
 
     @property
     def suspected(self) -> bool:
@@ -192,7 +188,10 @@ class EchoLimiter:
         """Take in a hop (hop,) of both; whether any of the echo is too loud."""
         now = Moments.of(mic, echo)
         self._smoothed = self._smoothed.smoothed(now)
-        self._wait(now.left() > EXCESS * now.mic)
+        self._waited = self._waited + 1 if now.left() > EXCESS * now.mic else max(self._waited - 1, 0)
+        self.changed = self._waited >= self._patience
+        if self.changed:
+            self._waited = 0
         self._weights[0] = self._weights[-1]
         self._weights[1:] = 1.0
         if now.left() > now.mic and self._smoothed.left() > self._smoothed.mic:
@@ -207,14 +206,8 @@ class EchoLimiter:
 
     def turn(self, factor: float) -> None:
         """The echo is factor times what it was."""
-        self._smoothed = self._smoothed.scaled(factor)
-
-    def _wait(self, excessive: bool) -> None:
-        """Tell that the path has changed once the echo was too loud for long enough."""
-        self._waited = self._waited + 1 if excessive else max(self._waited - 1, 0)
-        self.changed = self._waited >= self._patience
-        if self.changed:
-            self._waited = 0
+        mic, cross, echo = self._smoothed
+        self._smoothed = Moments(mic, cross * factor, echo * factor**2)
 
     def apply(self, echo: Samples) -> Samples:
         """The echo (hop,) with its weight, which falls at once and rises over a part."""
