@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
+from edgefilter.alignment.belief import REACH
 from edgefilter.alignment.coarse_lag import RANGE
 from edgefilter.dsp import fourier
 from edgefilter.dsp.frames import frames
@@ -16,7 +17,8 @@ from edgefilter.types import SAMPLE_RATE, Array, Samples
 STEP, STEPS = 0.01, 16
 """Step between neighbouring speeds, and between neighbouring bins, as natural logarithm, so that one speed moves a spectrum by one
 bin; and the number of speeds on each side of 1: 17 % either way."""
-LENGTH, AHEAD, BEHIND = (round(s * SAMPLE_RATE) for s in (2.5, 0.5, 3.0))
+LENGTH, AHEAD = (round(s * SAMPLE_RATE) for s in (2.5, 0.5))
+BEHIND = REACH
 """Samples of the microphone that are compared, and by how much it may be ahead of the reference and behind it."""
 CHANCE, CLEAR = 0.35, 0.5
 """Clearness that chance reaches, and by how much the summed clearness of the looks that agree on a speed must exceed that of the looks

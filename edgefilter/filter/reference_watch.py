@@ -31,8 +31,8 @@ NONE_CAME, SOUNDED = 60 * SAMPLE_RATE, 10 * SAMPLE_RATE
 converter, since there is nothing else to compare with. 16 bits by themselves are 41 dB softer."""
 FELL_SILENT = 1e-3
 """Power of the reference, over its power while the robot talks, below which it is silent, -30 dB: the noise of a loopback is."""
-SPEED_STRIDE, SPEED_LOOKS = SAMPLE_RATE, 8
-"""Samples of the robot's speech between two looks at the speed, and the most looks. There are looks only while the echo is not found."""
+SPEED_LOOKS = 8
+"""Most looks at the speed, each after another LOOK of the robot's speech. There are looks only while the echo is not found."""
 SAME_S = 2.0
 """Seconds of sound after which microphone and reference are compared sample by sample."""
 Verdict = Literal["unknown", "fits", "late"]
@@ -155,7 +155,7 @@ class ReferenceWatch:
         if not isinstance(found, tuple):  # a look is under way, or none is
             start = ref.end - AHEAD - LENGTH
             if found is False and onsets.active and self._to_compare <= 0 < self._looks_left:
-                self._to_compare, self._looks_left = SPEED_STRIDE, self._looks_left - 1
+                self._to_compare, self._looks_left = LOOK, self._looks_left - 1
                 self._speeds = speeds(heard.read(start, start + LENGTH), ref.read(start - BEHIND, ref.end))
                 next(self._speeds)  # while both are as they were read
             return None
