@@ -19,8 +19,7 @@ MOST_LAG_S = 3.0
 WINDOW = 7168
 """Samples of the microphone that one search looks at, 0.45 s."""
 MINIMUM = 832
-"""Samples (52 ms) of an utterance that must have been heard before its lag is believed: less of any two sounds may
-agree by chance."""
+"""Samples (52 ms) of an utterance that must have been heard before its lag is believed: less of any two sounds may agree by chance."""
 FADE = 256
 _RISE = rise(FADE).astype(np.float32)
 REFLECTIONS, REFLECTED = 320, 0.75
@@ -91,9 +90,9 @@ class LagSearch:
     the microphones on one clock, around the direct sound in the first at index PRE_ROLL: their phases are taken out, so
     that early reflections do not pull the peak, and the peaks of all microphones lie at one lag. Chance peaks grow with the
     root of the energy that a lag lets overlap, so the correlation is divided by that. `prepare`, `listen` and `find` are one
-    search and cost one transform each, `listen` one a microphone, so that they can be spread over three hops; while the
-    reference to be looked at is short, so are the transforms. max_lag, early: samples by which the microphone and the reference
-    may be late. any_lag: by which they may be in a look that supposes nothing, and of the microphone in that look, WINDOW or more.
+    search and cost one transform each, `listen` one a microphone, so that they can be spread over three hops. max_lag, early:
+    samples by which the microphone and the reference may be late. any_lag: by which they may be in a look that supposes
+    nothing, and of the microphone in that look, WINDOW or more.
     """
 
     def __init__(

@@ -204,9 +204,9 @@ class FirstSounds:
         self._heard, self._since, self._before = False, 0, 0
 
     def step(self, mic: Samples, explained: Samples, loudest: float, state: AlignmentState, waits: bool) -> bool:
-        """Take a hop; whether its sound is the robot at another delay.
+        """Take a hop mic (hop,); whether its sound is the robot at another delay.
 
-        mic: (hop,). explained: (hop,), the reference at the present delay, zeros while no delay is known. loudest: mean square of the
+        explained: (hop,), the reference at the present delay, zeros while none is known. loudest: mean square of the
         reference's loudest hop. waits: whether there is an utterance whose delay was not found yet.
         """
         power, brought = float(np.dot(mic, mic)), float(np.dot(explained, explained))

@@ -60,7 +60,7 @@ class BargeInSettings:
     somebody is suspected to speak; 0, never. What is heard with the lower voice then decides, unless a calibrated robot is
     certain before. It needs a player that follows `EgoFilter.voice_gain`; 12 dB is what one person does when another begins
     to talk.
-    Raises UsageError for probabilities outside 0 to 1, a release above the threshold, negative times or decibels, or another judge.
+    Raises UsageError for a setting beyond these bounds.
     """
 
     threshold: float = 0.97

@@ -94,9 +94,9 @@ def choose(
 ) -> Choice:
     """The first of candidates, best first, whose p99 compute per hop at the real pace is within budget_ms.
 
-    Figures of an earlier call on this machine, with these versions, models, cores and this length of path, are used
-    again; what is missing is measured, in less than 6 s an engine, and once more where it is too slow, for something else
-    may have taken the cores. say: told what is going on. Raises UsageError where no candidate can be made.
+    Figures of an earlier call (`_about`, and the same model) are used again; what is missing is measured, in less than 6 s an
+    engine, and once more where it is too slow, for something else may have taken the cores. say: told what is going on.
+    Raises UsageError where no candidate can be made.
     """
     cores = min(CORES, len(allowed_cores()))
     about = _about(cores, profile)

@@ -17,9 +17,9 @@ from edgefilter.filter.volume import EchoLimiter, Volume
 from edgefilter.types import LOUDEST, SAMPLE_RATE, CancellerStats, Samples, Spectrum
 
 SHELF_HZ = 300.0, 450.0
-"""Corners of the low shelf through which the filter hears, 7 dB deep: a block without a window spreads hum over all bins. A
-deeper one keeps off more, but what is lowered is learned more slowly: without a profile the demonstration's robot is 5 dB
-louder below 200 Hz with 24 dB and 1 dB with 7; of 17 real devices 12 dB cost one 2.4 dB of the robot, 7 dB 0.8."""
+"""Corners of the low shelf through which the filter hears, 7 dB deep: a block without a window spreads hum over all bins. What
+is lowered is learned more slowly: without a profile the demonstration's robot is 5 dB louder below 200 Hz with 24 dB and
+1 dB with 7; of 17 real devices 12 dB cost one 2.4 dB of the robot, 7 dB 0.8."""
 PRIOR_VARIANCE = 0.05
 """Variance of a calibrated path relative to its own power: the robot moved and the room is another."""
 UNKNOWN_VARIANCE = 0.1
@@ -128,13 +128,13 @@ class Canceller:
     partitioned as in Kuech, Mabande & Enzner (2014), "State-space architecture of the partitioned-block-based acoustic
     echo controller". Its inputs are the reference x and the products d x and d^2 x, d being the membrane's displacement (x
     low-passed): force factor and stiffness of a moving-coil loudspeaker depend on the displacement (Klippel 2006,
-    "Loudspeaker nonlinearities"). Their paths are PRODUCT_PARTITIONS long and start at zero. adaptation: WARM where
-    impulse_response is given, COLD where not, unless said otherwise. impulse_response (n,) float32 starts the filter;
-    longer than taps it is cut, without it the start is cold. microphones: of an array, None for a single one: signals are
-    then (microphones, hop), the impulse response (microphones, n), and each microphone has its own path; the volume, and whether
-    there is an echo, is decided in one microphone (tell_by) for all. behind(echo, mic) (hop,): the microphone's own processing of
-    the echo; None where it has none. Raises SignalError where hop or taps are not
-    positive or the impulse response is not finite.
+    "Loudspeaker nonlinearities"). Their paths are PRODUCT_PARTITIONS long and start at zero.
+
+    impulse_response: (n,) float32 to start from, cut to taps. adaptation: WARM where that is given, COLD where not, unless
+    said otherwise. microphones: of an array, None for a single one: signals are then (microphones, hop), the impulse response
+    (microphones, n), and each microphone has its own path; the volume, and whether there is an echo, is decided in one of
+    them (tell_by). behind(echo, mic) (hop,): the microphone's own processing of the echo; None where it has none. Raises
+    SignalError where hop or taps are not positive or the impulse response is not finite.
     """
 
     def __init__(
@@ -405,10 +405,9 @@ class Canceller:
         return canceller
 
     def rewrite_reference(self, history: Samples) -> None:
-        """Replace the past of the reference after a realignment.
+        """Replace the past of the reference by history (n,) float32, the last samples under a new delay before the hop that is stepped next.
 
-        history: (n,) float32, the last n reference samples under the new delay before the hop that is about to be stepped;
-        what is missing of `self.history` samples counts as silence.
+        What is missing of `self.history` samples counts as silence.
         """
         past = np.concatenate((np.zeros(self.history), history), dtype=np.float32)[-self.history :]
         channels = past[None]

@@ -55,8 +55,7 @@ class EgoFilter:
         Keep the output of the linear stage for each microphone channel, for `robot_removed`.
     on_suspicion : callable, optional
         Called in the same way with "speech_suspected", some 50 ms before a human's speech counts as begun, and with
-        "speech_dismissed" where nobody spoke, 0.3 s later at most (`BargeInSettings.confirm_s`), or as long after a lower
-        voice is heard (`voice_gain`).
+        "speech_dismissed" where nobody spoke, `BargeInSettings.confirm_s` later at most, or after a lower voice is heard.
     output : str
         Which of two sounds `process` returns; `other` gives the other one. "recognise": for a recogniser; while the robot is
         silent it keeps more of the fan and has fewer gaps in the voice. "listen": for a call, a level meter or a detector of speech;
@@ -73,7 +72,7 @@ class EgoFilter:
     Raises
     ------
     UsageError
-        For an unknown engine, one that lacks its profile, a model without an engine for it, or another output.
+        For an unknown engine or output, an engine that lacks its profile, or a model without an engine for it.
     ProfileError, ModelError
         For a file that is damaged or of another version.
 
@@ -172,9 +171,8 @@ class EgoFilter:
     def speech_probability(self) -> float | None:
         """Probability that the human speaks now, 0 to 1: what the network says of the latest hop, calibrated.
 
-        None before the first hop and with engines that do not judge it: all but crnn, unless the settings of barge-in
-        have judge="network"; they give no events of speech either. 0 while nothing tells a human from the robot, whose
-        lag is not found yet or whose reference comes later.
+        None before the first hop and with engines that do not judge it, and give no events of speech: all but crnn, unless
+        barge-in has judge="network". 0 while the robot's lag is not found yet, or its reference comes later.
         """
         return self._stream.speech_probability
 
@@ -235,12 +233,12 @@ class EgoFilter:
         return self._stream.process(mic_block, ref_block)
 
     def other(self) -> Samples:
-        """The other sound of the samples that the latest `process` or `flush` returned: see `output` of the class.
+        """The other sound (see `output` of the class) of the samples that the latest `process` or `flush` returned.
 
         Returns
         -------
         ndarray of float32, shape (m,)
-            As many samples, with the same latency. Nothing before the first call.
+            As many samples. Nothing before the first call.
 
         Examples
         --------
@@ -337,13 +335,7 @@ class EgoFilter:
             self._stream.learner.close()
 
     def stats(self) -> Stats:
-        """State of the path.
-
-        Returns
-        -------
-        Stats
-            Ready for JSON: engine and why, its model, latency, samples, alignment, linear stage, deadlines.
-        """
+        """State of the path, ready for JSON."""
         front = self._stream.front
         model: Model | None = getattr(self._engine, "model", None)
         return {
@@ -429,10 +421,8 @@ def enhance(
 
     Raises
     ------
-    SignalError
-        For another shape or dtype, unequal lengths, or samples that are not finite or beyond 1e6.
-    UsageError, ProfileError, ModelError
-        As of `EgoFilter`.
+    SignalError, UsageError, ProfileError, ModelError
+        As of `EgoFilter.process` and of `EgoFilter`.
 
     Examples
     --------

@@ -52,7 +52,6 @@ class LinearStage:
     """Tracked delay, echo path and residual echo: what only front ends of the kind "full" have.
 
     learner: told of every hop; the update that it answers is adopted with the next one. update: adopted in the latest hop.
-    removal: how much of the robot is removed.
     """
 
     update: PathUpdate | None = None
@@ -227,7 +226,7 @@ class FrontEnd:
         """Tell residual echo and spatial filter what the engine made of the latest frame, and whether a human speaks.
 
         probability: None from an engine that does not judge it; the share of what exceeds fan and residual echo then
-        stands for it, and for the mask. Frames that may hold the robot at any lag teach nothing: its echo is not subtracted.
+        stands for it, and for the mask. Frames that may hold the robot at any lag teach nothing.
         """
         if self.linear_stage:
             self.linear_stage.residual.nobody_speaks = probability is not None and not speaking
@@ -242,7 +241,7 @@ class FrontEnd:
         self.spatial.learn(self.errors, gain, probability, speaking, frame.idle)
 
     def _added(self, source: SourceChain) -> Samples | None:
-        """Expected power of the effects that no waveform predicts, for the path in use, (bins,); a update can change it."""
+        """Expected power of the effects that no waveform predicts, for the path in use, which an update changes, (bins,)."""
         if source is not self._source:
             self._source = source
             self._unpredictable = Unpredictable(self._stft, source.colours) if source.colours else None

@@ -27,8 +27,8 @@ many, 1 ms of them in a block, are no single peak."""
 class Microphones:
     """Watches the microphones of one stream; step once a hop.
 
-    left_out: why, by number. first: the first one that is used. paths: (microphones, taps) of the echo where they are
-    calibrated, which tell exchanged channels, once, in the first block that is full of the robot.
+    left_out: why, by number. paths: (microphones, taps) of the echo where they are calibrated, which tell exchanged channels,
+    once, in the first block that is full of the robot.
     """
 
     def __init__(self, count: int, hop: int, paths: Samples | None = None) -> None:

@@ -66,11 +66,9 @@ class Removal:
 
     @property
     def removed_db(self) -> float | None:
-        """Echo return loss enhancement, dB, over that half of the last 5 s of robot speech in which it is higher.
+        """Echo return loss enhancement, dB, over that half of the last 5 s of robot speech in which it is higher; None before 3 s.
 
         The other half may hold a human, which the filter rightly leaves.
-
-        None before 3 s.
         """
         if len(self._blocks) < ENOUGH:
             return None

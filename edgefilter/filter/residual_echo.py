@@ -78,12 +78,10 @@ class NoiseTracker:
 class Residual:
     """Tracks the stationary noise and the residual echo of one stream; step() once per frame.
 
-    The noise is what NoiseTracker finds in the error; with a profile, the calibrated shape at that level. The
-    leakage is the part of the echo that stays, in the echo's own bins. It follows the least ratio of error to echo while the
-    robot speaks, for a human can only add to it, and begins with the loudspeaker's distortion where the profile knows it
-    from multisines.
-    What else sounds with the voice, in any bin (motors), is followed as a part of the echo's whole power while it is known
-    that no human speaks.
+    The noise is what NoiseTracker finds in the error; with a profile, the calibrated shape at that level. The leakage, the
+    part of the echo that stays in its own bins, begins with the loudspeaker's distortion where the profile knows it from
+    multisines, and follows the least ratio of error to echo while the robot speaks, for a human can only add to it. What else
+    sounds with the voice, in any bin (motors), is followed as a part of the echo's whole power.
 
     nobody_speaks: whether that is known; set by who hears the answer. with_voice: (bins,), that part, as in `WhileMoving`.
     """

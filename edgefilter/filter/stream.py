@@ -48,11 +48,8 @@ SOFTER_HOPS = 3
 class Stream:
     """Runs one engine over blocks of any length; whatever the partition, the output is bit-identical.
 
-    process, flush, robot_removed and the properties are those of `EgoFilter`. With an engine that waits for the end,
-    process returns nothing and flush everything. stepping: takes the compute time of every hop and may choose another engine, which becomes an
-    event. barge_in, learner, on_barge_in, keep_channels, on_suspicion, output: as of `EgoFilter`. other: (n,), the one of the two
-    sounds (to recognise, to listen to) that process or flush did not return, of the same samples. queued: samples that the
-    loudspeaker has been given and not played yet: they cannot be lowered any more.
+    All that has a name of `EgoFilter` is the same here; events and other are attributes. stepping: takes the compute time of
+    every hop and may choose another engine, which becomes an event. queued: samples, as `EgoFilter.queued_s`.
     """
 
     def __init__(
@@ -141,7 +138,7 @@ class Stream:
         return self._deliver(rest[:, :missing])
 
     def _expect(self, microphones: int | None) -> None:
-        """Be ready for that many microphones, None for one; raises SignalError where the recording so far, or the profile, has another number."""
+        """Be ready for that many microphones, None for one; SignalError where the recording so far, or the profile, has another number."""
         if self.samples_in == 0:
             known = 1 if self.profile is None else self.profile.microphones
             if self.profile and known != (microphones or 1):
@@ -159,10 +156,7 @@ class Stream:
             raise SignalError(f"{found}, expected the same number until the end: call reset() before another recording")
 
     def _deliver(self, out: Samples) -> Samples:
-        """Of the finished samples of both sounds (2, n), behind those that are kept, the one that was asked for.
-
-        Where a callback has raised they are all kept.
-        """
+        """The sound that was asked for, of the finished samples (2, n) behind those kept; all are kept where a callback has raised."""
         if self._kept.size:
             out = np.concatenate((self._kept, out), axis=1)
         error, self._raised = self._raised, None
@@ -288,8 +282,8 @@ class Stream:
 def step(engine: Engine, frame: Frame, state: EngineState) -> tuple[Output, EngineState]:
     """The engine's answer and its next state.
 
-    While the robot's lag is unknown (frame.at_any_lag) nothing tells robot from human: the answer is then the error,
-    lowered to FLOOR times the stationary noise's amplitude, the probability of speech is 0, and the engine's state stays.
+    While nothing tells robot from human (frame.at_any_lag) the answer is the error, lowered to FLOOR times the stationary
+    noise's amplitude, the probability of speech is 0, and the engine's state stays.
     """
     output, following = engine.step(frame, state)
     if not frame.at_any_lag:

@@ -25,9 +25,9 @@ WAITING_S = 600.0
 class Turns:
     """Keeps the latest frames of one stream; step once a frame.
 
-    stft: of the frames. spatial: of an array; with one microphone a second look finds nothing new, and the turn is what
-    was streamed. Of an array's frame the errors and the engine's answer over the error are kept, (microphones + 1, bins), so that
-    another spatial filter costs no second run of the engine, else the answer, (1, bins).
+    spatial: of an array; with one microphone a second look finds nothing new, and the turn is what was streamed. Of an
+    array's frame the errors and the engine's answer over the error are kept, (microphones + 1, bins), so that another spatial
+    filter costs no second run of the engine; else the answer, (1, bins).
     """
 
     def __init__(self, stft: StftConfig, spatial: SpatialFilter | None) -> None:
