@@ -10,7 +10,6 @@ import numpy as np
 
 from edgefilter.alignment.aligner import Aligned
 from edgefilter.dsp import fourier
-from edgefilter.dsp.ring import Ring
 from edgefilter.dsp.stft import Synthesiser
 from edgefilter.engines.base import ClipEngine, Engine, EngineState
 from edgefilter.engines.spectral_subtraction import FLOOR
@@ -95,7 +94,7 @@ class Stream:
         self._state = None if self.engine.lookahead is None else self.engine.initial_state()
         self._clip: list[Frame] = []
         self._synthesiser = Synthesiser(stft, sounds=2)
-        self._mic, self._ref = Ring(2 * stft.hop), Ring(2 * stft.hop)
+        self._left_mic = self._left_ref = np.zeros(0, np.float32)  # of a hop that is not whole yet
         self._before_start = self.latency - stft.hop
         self._raised: BaseException | None = None
         self._kept = NOTHING
@@ -149,8 +148,8 @@ class Stream:
             if microphones != self._microphones:
                 self.front = FrontEnd(self.engine, self.profile, self.learner, microphones, self.front.aligner)
                 self._turns = Turns(self.engine.stft, self.front.spatial)
-                self._mic = Ring(2 * self.engine.stft.hop, microphones)
                 self._microphones = microphones
+                self._left_mic = np.zeros((microphones, 0) if microphones else 0, np.float32)
         if microphones != self._microphones:
             found = f"mic has {microphones or 1} channels after {self._microphones or 1}"
             raise SignalError(f"{found}, expected the same number until the end: call reset() before another recording")
@@ -168,16 +167,15 @@ class Stream:
 
     def _run(self, mic: Samples, ref: Samples) -> Samples:
         hop = self.engine.stft.hop
-        done: list[Samples] = []
-        for at in range(0, ref.size, hop):
-            if ref.size - at >= hop and not len(self._mic):
-                done.append(self._watched_step(mic[..., at : at + hop], ref[at : at + hop]))
-                continue
-            self._mic.write(mic[..., at : at + hop].T)
-            self._ref.write(ref[at : at + hop])
-            if len(self._mic) >= hop:
-                done.append(self._watched_step(np.ascontiguousarray(self._mic.read(hop).T), self._ref.read(hop)))
-        return self._finish(done)
+        mic, ref = np.concatenate((self._left_mic, mic), axis=-1), np.concatenate((self._left_ref, ref))
+        whole = ref.size - ref.size % hop
+        self._left_mic, self._left_ref = mic[..., whole:].copy(), ref[whole:].copy()
+        return self._finish(
+            [
+                self._watched_step(np.ascontiguousarray(mic[..., at : at + hop]), ref[at : at + hop])
+                for at in range(0, whole, hop)
+            ]
+        )
 
     def _finish(self, done: list[Samples]) -> Samples:
         """What of the synthesised hops (2, hop) belongs to samples that came in, and not to the silence before them."""
