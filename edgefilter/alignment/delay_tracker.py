@@ -231,12 +231,16 @@ class DriftFilter:
     The accuracy that a measurement reports is too optimistic while a human talks as well or the response is still being learnt:
     the errors of measurements close to one another are then alike. So a measurement weighs less the less of the microphone it
     explains, and where measurements agree with one another but contradict the estimate, its covariance grows until it can
-    follow them (fading memory, Sorenson & Sacks 1971).
+    follow them (fading memory, Sorenson & Sacks 1971). What the latest looks that agree on a jump have seen is remembered.
+
+    >>> look = DelayMeasurement(100.0, 0.01, strength=10.0, ratio=1.6, explained=0.5, gain=1.0, gain_there=1.0)
+    >>> drift = DriftFilter()
+    >>> drift.convinced(look), drift.convinced(look)
+    (False, True)
     """
 
     def __init__(self) -> None:
         self.slope, self._slope_variance = 0.0, SLOPE_DEVIATION**2
-        self._witness = JumpWitness()
         self.restart(float("nan"))
         self.shared = float("inf")  # no delay is known
 
@@ -250,7 +254,7 @@ class DriftFilter:
         self.delay, self.shared = delay, 0.0
         self._variance, self._covariance = deviation**2, 0.0
         self._since = 0
-        self._witness.forget()
+        self._jump, self._shown = float("nan"), 0.0
 
     def step(self, found: DelayMeasurement) -> None:
         """Move the delay by the measured offset: it has jumped. A small offset may as well come from a wrong slope since the last measurement."""
@@ -286,7 +290,16 @@ class DriftFilter:
             return "drowned"
         if not FAINT < found.gain_there / gain < STRANGE or size > (3 if far else 1) * REACH - EDGE:
             return "unseen"
-        return "jumped" if self._witness.convinced(found) else "elsewhere"
+        return "jumped" if self.convinced(found) else "elsewhere"
+
+    def convinced(self, found: DelayMeasurement) -> bool:
+        """Take in a look at which the delay seems to have jumped by its offset; True if that is certain now, by the looks that agree on it."""
+        shown, size = min(found.evidence / E_FOLD, ONE_LOOK), abs(found.offset)
+        if abs(found.offset - self._jump) < DRIFTED:
+            shown += self._shown
+        self._jump, self._shown = found.offset, shown
+        lags = 4 * SMALL + 1 if size <= SMALL else 2 * REACH if size <= REACH else CERTAIN**2 * 6 * REACH
+        return self._shown > math.log(CERTAIN * lags)
 
     def correct(self, measurement: DelayMeasurement) -> None:
         """Take in a measured offset, which holds for the middle of its frame."""
@@ -307,7 +320,7 @@ class DriftFilter:
         self._covariance -= delay * slope / spread
         self._since = 0
         self._slope_variance -= slope * slope / spread
-        self._witness.forget()
+        self._jump, self._shown = float("nan"), 0.0
 
     def _noise(self, measurement: DelayMeasurement) -> float:
         """Variance of a look, with what its error has in common with its neighbours', which their number does not average out.
@@ -324,29 +337,3 @@ class DriftFilter:
         delay = self._variance - half * self._covariance
         slope = self._covariance - half * self._slope_variance
         return delay, slope, delay - half * slope
-
-
-class JumpWitness:
-    """Remembers the jump that the latest looks agree on, and how much more likely than chance it makes what they saw.
-
-    >>> look = DelayMeasurement(100.0, 0.01, strength=10.0, ratio=1.6, explained=0.5, gain=1.0, gain_there=1.0)
-    >>> witness = JumpWitness()
-    >>> witness.convinced(look), witness.convinced(look)
-    (False, True)
-    """
-
-    def __init__(self) -> None:
-        self.forget()
-
-    def forget(self) -> None:
-        """The delay was confirmed or replaced."""
-        self._offset, self._shown = float("nan"), 0.0
-
-    def convinced(self, found: DelayMeasurement) -> bool:
-        """Take in a look at which the delay seems to have jumped by its offset; True if that is certain now."""
-        shown, size = min(found.evidence / E_FOLD, ONE_LOOK), abs(found.offset)
-        if abs(found.offset - self._offset) < DRIFTED:
-            shown += self._shown
-        self._offset, self._shown = found.offset, shown
-        lags = 4 * SMALL + 1 if size <= SMALL else 2 * REACH if size <= REACH else CERTAIN**2 * 6 * REACH
-        return self._shown > math.log(CERTAIN * lags)

@@ -10,7 +10,7 @@ from scipy import signal
 from edgefilter.alignment import aligner as aligner_module
 from edgefilter.alignment.aligner import Aligner
 from edgefilter.alignment.delay_line import DelayBuffer, read_delayed, read_line
-from edgefilter.alignment.delay_tracker import DelayMeasurement, DelayMeter, JumpWitness
+from edgefilter.alignment.delay_tracker import DelayMeasurement, DelayMeter, DriftFilter
 from edgefilter.alignment.lag_search import Found, LagSearch
 from edgefilter.alignment.paper import PaperAligner
 from edgefilter.alignment.utterances import Utterance
@@ -245,16 +245,16 @@ def test_a_faint_agreement_while_the_robot_is_muted_is_no_jump():
 def test_a_missed_look_or_another_suspicion_does_not_undo_a_jump_that_is_seen_again():
     look = DelayMeasurement(100.0, 0.01, 10.0, 1.6, 0.5, 1.0, 1.0)
     other = replace(look, offset=-300.0, strength=8.0, ratio=1.1)
-    witness = JumpWitness()
+    witness = DriftFilter()
     assert (
         not witness.convinced(look)
         and not witness.convinced(other)
         and not witness.convinced(replace(look, strength=9.0))
     )
     assert witness.convinced(look)  # 16 of evidence, faded to 11 by the other look, and two more
-    witness.forget()
+    witness.restart(0.0)
     assert not witness.convinced(look)
-    assert not JumpWitness().convinced(replace(look, offset=5.0)) and JumpWitness().convinced(
+    assert not DriftFilter().convinced(replace(look, offset=5.0)) and DriftFilter().convinced(
         replace(look, offset=5.0, strength=13.0)
     )
 
@@ -517,5 +517,5 @@ def test_where_no_measurement_sees_the_robot_its_arrival_is_studied_once_it_is_f
 
 def test_one_look_is_not_enough_for_a_far_jump_however_clear_it_is():
     look = DelayMeasurement(312.0, 0.01, strength=13.7, ratio=3.2, explained=0.0, gain=1.0, gain_there=1.0)
-    witness = JumpWitness()
+    witness = DriftFilter()
     assert not witness.convinced(look) and witness.convinced(look)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edgefilter.alignment.delay_line import DelayBuffer
-from edgefilter.alignment.delay_tracker import FRAME, STRIDE, DelayMeasurement, DelayMeter, DriftFilter, JumpWitness
+from edgefilter.alignment.delay_tracker import FRAME, STRIDE, DelayMeasurement, DelayMeter, DriftFilter
 
 
 def look(
@@ -89,20 +89,20 @@ def test_a_far_look_sees_three_times_as_far():
 @pytest.mark.parametrize(("offset", "enough"), [(8.0, 20.0), (8.1, 30.0), (1024.0, 30.0), (-1025.0, 55.7)])
 def test_a_jump_is_believed_from_so_much_evidence_on_as_chance_has_places(offset, enough):
     for share, believed in ((0.99, False), (1.01, True)):
-        witness, half = JumpWitness(), look(offset, 1.0, 0.5 * share * enough)
+        witness, half = DriftFilter(), look(offset, 1.0, 0.5 * share * enough)
         assert [witness.convinced(half) for _ in range(2)] == [False, believed]
 
 
 @pytest.mark.parametrize(("further", "believed"), [(1.49, True), (1.51, False), (-1.49, True)])
 def test_the_evidence_of_looks_at_the_same_jump_is_added(further, believed):
-    witness = JumpWitness()
+    witness = DriftFilter()
     assert not witness.convinced(look(100.0, 1.0, 0.6 * 30.0))
     assert witness.convinced(look(100.0 + further, 1.0, 0.6 * 30.0)) is believed
 
 
 @pytest.mark.parametrize("other", [0.1, 0.6])
 def test_a_suspicion_is_replaced_by_another(other):
-    witness = JumpWitness()
+    witness = DriftFilter()
     witness.convinced(look(100.0, 1.0, 0.9 * 30.0))
     assert not witness.convinced(look(-50.0, 1.0, other * 30.0))
     assert not witness.convinced(look(100.0, 1.0, 0.9 * 30.0))
