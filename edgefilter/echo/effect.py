@@ -91,8 +91,9 @@ class Effect:
     free: ClassVar[bool] = False
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """The signal (n,) after the effect; x is not written to. By default x itself, as for an effect of stage "noise"."""
-        return x.copy()
+        """The signal (n,) after the effect; x is not written to. By default what run() makes of all of it, or x itself."""
+        stream = self.run(values, sample_rate)
+        return x.copy() if stream is None else stream(x)
 
     def run(self, values: Values, sample_rate: int) -> Runner | None:
         """The effect on a stream, for one that remembers much or follows what the microphone hears; None: apply is all there is."""

@@ -81,8 +81,7 @@ class Bandlimit(Effect):
         response = low_pass(hz, float(values["cutoff_hz"]), float(values["order"]), float(values["phase"]))
         response = response * np.exp(-2j * np.pi * hz / sample_rate * float(values["delay"]))
         y = filtered(x, fft.fftshift(fft.irfft(response, FFT)), FFT // 2)
-        taps = numbers(values, "taps")
-        return y + filtered(x, taps, LEAD) if taps.any() else y
+        return y + filtered(x, numbers(values, "taps"), LEAD)
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """The best of a grid of cut-offs, orders and phases, refined, each at its best delay and gain, in the whitened cross-spectrum. Then taps.

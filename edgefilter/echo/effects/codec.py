@@ -11,7 +11,7 @@ from scipy.ndimage import uniform_filter, uniform_filter1d
 
 from edgefilter.dsp.convolution import filtered
 from edgefilter.dsp.fourier import power as power_of
-from edgefilter.dsp.frames import decibels, frames
+from edgefilter.dsp.frames import decibels, frames, stretch
 from edgefilter.dsp.psd import hann
 from edgefilter.echo.effect import Effect, Parameter, first, neutral, numbers, within
 from edgefilter.echo.effects.bandlimit import LEAD, short_filter
@@ -128,8 +128,8 @@ class Codec(Effect):
 def _levels(x: Samples, decay_ms: float) -> Array:
     """Power of x (n,) in each band, decaying by 1/e in decay_ms, as late as the direct sound, (frames, BANDS)."""
     keep = np.exp(-HOP / (decay_ms * 1e-3 * SAMPLE_RATE))
-    delayed = np.concatenate((np.zeros(PRE_ROLL, np.float32), x))[: x.size]
-    return np.maximum(scipy.signal.lfilter([1.0 - keep], [1.0, -keep], band_power(delayed), axis=0), 1e-12)
+    heard = band_power(stretch(x, -PRE_ROLL, x.size - PRE_ROLL))
+    return np.maximum(scipy.signal.lfilter([1.0 - keep], [1.0, -keep], heard, axis=0), 1e-12)
 
 
 def _is_codec(measurement: Measurement, voice: Samples) -> bool:
@@ -166,10 +166,8 @@ def _follows(said: NDArray[np.complex64], rest: NDArray[np.complex64], whole: ND
     )
     use = whole[:, None] & (over > HEARD) & (loud > HEARD)
     count = np.maximum(use.sum(axis=0), 1)
-    swings = []
-    for level in (decibels(np.maximum(over - 1.0, 0.1)), decibels(np.maximum(loud, 0.1))):
-        swings.append(use * (level - (use * level).sum(axis=0) / count))
-    a, b = swings
+    levels = decibels(np.maximum(over - 1.0, 0.1)), decibels(np.maximum(loud, 0.1))
+    a, b = (use * (level - (use * level).sum(axis=0) / count) for level in levels)
     return float(np.sum(a * b) / np.sqrt(np.sum(a * a) * np.sum(b * b) + 1e-12))
 
 

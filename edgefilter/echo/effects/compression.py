@@ -48,9 +48,6 @@ class Compression(Effect):
         Parameter("makeup_db", "dB", 0.0, -40.0, 40.0),
     )
 
-    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        return Compressor(values, sample_rate)(x)
-
     def run(self, values: Values, sample_rate: int) -> Runner:
         return Compressor(values, sample_rate)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from edgefilter.dsp.fractional_delay import delayed
+from edgefilter.dsp.frames import stretch
 from edgefilter.echo.effect import NEVER_S, Effect, Parameter, complete, neutral, numbers
 from edgefilter.echo.effects.clock_drift import STEADY, robust_line
 from edgefilter.echo.lag_track import LagTrack, lags_of
@@ -127,11 +128,7 @@ def _later(x: Samples, delay: float, start: int, stop: int) -> Samples:
         near[-FADE:] *= fade[::-1]
     if near.size and delay != whole:
         near = delayed(near, delay - whole)
-    out = np.zeros(stop - start, np.float32)
-    lag = first + whole - start
-    part = near[max(-lag, 0) : out.size - lag] if lag < out.size else near[:0]
-    out[max(lag, 0) : max(lag, 0) + part.size] = part
-    return out
+    return stretch(near, start - whole - first, stop - whole - first)
 
 
 def find_steps(lag: Array, sigma: Array) -> tuple[Array, Array]:

@@ -57,8 +57,7 @@ class Equaliser(Effect):
             nepers = _basis(FFT // 2 + 1, sample_rate, gain_db.size) @ (gain_db * (np.log(10.0) / 20.0))
             response = np.exp(nepers - 2j * np.pi * hz / sample_rate * delay)
             y = filtered(x, fft.fftshift(fft.irfft(response, FFT)), FFT // 2)
-        taps = numbers(values, "taps")
-        return y + filtered(x, taps, LEAD) if taps.any() else y
+        return y + filtered(x, numbers(values, "taps"), LEAD)
 
     def fit(self, measurement: Measurement, model: VoiceModel) -> Values:
         """Levenberg-Marquardt in the gains of all knots and the delay, in the whitened cross-spectrum; then taps. Neutral for a turned volume."""

@@ -193,9 +193,6 @@ class FreeGain(FreeLaw):
         Parameter("exponent", "of power", 1.0, 0.01, 10.0),
     )
 
-    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        return x.copy() if vanishes(self, values) else _GainByLevel(values)(x)
-
     def run(self, values: Values, sample_rate: int) -> Runner:
         return _GainByLevel(values)
 
@@ -366,9 +363,6 @@ class FreeModulation(FreeLaw):
         ),  # of the cosines of the rate and its multiples, then of the sines
     )
     run_note = "its phase is of this recording; the running filter follows it from there"
-
-    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        return x.copy() if vanishes(self, values) else _Waves(values)(x)
 
     def run(self, values: Values, sample_rate: int) -> Runner:
         return _Waves(values)

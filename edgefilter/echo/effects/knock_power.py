@@ -11,7 +11,7 @@ import scipy
 from numpy.typing import NDArray
 
 from edgefilter.dsp.fourier import power
-from edgefilter.dsp.frames import frames
+from edgefilter.dsp.frames import frames, stretch
 from edgefilter.dsp.psd import GRID_BINS, floored, frequencies, hann
 from edgefilter.echo.effect import NEVER_REACHED
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
@@ -178,8 +178,8 @@ def quantiles_of_peaks(moved: Samples) -> list[float]:
 def ringing_of(knocks: Samples, decay_ms: float, sample_rate: int = SAMPLE_RATE) -> Samples:
     """Squared heights of knocks (n,) as they are heard, PRE_ROLL samples later, decaying by 1/e in decay_ms; (n,)."""
     keep = np.exp(-1.0 / (decay_ms * 1e-3 * sample_rate))
-    delayed = np.concatenate((np.zeros(PRE_ROLL), knocks.astype(np.float64) ** 2))[: knocks.size]
-    return scipy.signal.lfilter([1.0], [1.0, -keep], delayed).astype(np.float32)
+    heard = stretch(knocks, -PRE_ROLL, knocks.size - PRE_ROLL).astype(np.float64)
+    return scipy.signal.lfilter([1.0], [1.0, -keep], heard**2).astype(np.float32)
 
 
 def band_power(x: Samples) -> Samples:

@@ -83,8 +83,10 @@ class LateReverb(AddedResponse):
 
 def with_added(response: Samples, values: Values, lead: int = LEAD) -> Samples:
     """The response (k,) with what is added to it, or what a filter behind it adds, its taps from lag -lead on, (k,)."""
-    added, taps = numbers(values, "added")[: response.size], numbers(values, "taps")
-    changed = response + filtered(response, taps, lead) if taps.any() else response.copy()
+    added, changed = (
+        numbers(values, "added")[: response.size],
+        response + filtered(response, numbers(values, "taps"), lead),
+    )
     changed[: added.size] += added.astype(np.float32)
     return changed
 

@@ -46,9 +46,6 @@ class Limiter(Effect):
         Parameter("taken_db", "dB", 0.0, 0.0, 140.0),
     )
 
-    def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        return PeakLimiter(values, sample_rate)(x)
-
     def run(self, values: Values, sample_rate: int) -> Runner:
         return PeakLimiter(values, sample_rate)
 

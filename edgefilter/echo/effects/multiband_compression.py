@@ -8,6 +8,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from edgefilter.dsp.frames import stretch
 from edgefilter.echo.effect import Effect, Parameter, Runner, complete, neutral, numbers
 from edgefilter.echo.effects.compression import STEEPEST, Compressor
 from edgefilter.echo.effects.equaliser import MOST_DB
@@ -177,8 +178,7 @@ def find_crossovers(found: Spectra) -> tuple[float, float, float] | None:
 
 def _moved(x: Samples, delay: float) -> Samples:
     """Delay x (n,) by that many whole samples."""
-    samples = round(delay)
-    return np.pad(x, (max(samples, 0), max(-samples, 0)))[max(-samples, 0) :][: x.size]
+    return stretch(x, -round(delay), x.size - round(delay))
 
 
 def _halves(hz: Array, crossover_hz: float) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
