@@ -16,7 +16,7 @@ from edgefilter.dsp.frames import block_power, blocks, decibels, frames
 from edgefilter.dsp.psd import frequencies, periodograms, total_power
 from edgefilter.echo.effects.catalogue import chain
 from edgefilter.echo.measurement import whiten
-from edgefilter.echo.model import EchoModel
+from edgefilter.echo.model import EchoModel, through
 from edgefilter.echo.recording import BLOCK
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
@@ -123,16 +123,9 @@ def independence_of(prepared: Straightened, model: EchoModel, score: Score) -> I
     prepared = prepared.behind(model)
     measurement, use, active = prepared.measurement, prepared.usable, prepared.active
     flat = (measurement.recording - score.prediction) / model.microphone_gain(measurement.recording.size)
-    said = _as_played(measurement.reference, model)
-    return independence(flat, said, prepared.noise_psd, use & active, use & ~active)
-
-
-def _as_played(reference: Samples, model: EchoModel) -> Samples:
-    """The reference (n,) with the model's clock drift and its effects ahead of the loudspeaker: the input of the loudspeaker."""
-    for effect, values in chain(model.effects):
-        if effect.stage in ("source", "time"):
-            reference = effect.apply(reference, values, SAMPLE_RATE)
-    return reference
+    ahead = [pair for pair in chain(model.effects) if pair[0].stage in ("source", "time")]
+    played = through(ahead, measurement.reference)  # by the loudspeaker, with the clock's drift
+    return independence(flat, played, prepared.noise_psd, use & active, use & ~active)
 
 
 def _by_band(residual: Samples, psd: Samples, use: NDArray[np.bool_]) -> Rows:

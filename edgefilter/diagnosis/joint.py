@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 from edgefilter.diagnosis.criteria import Criteria
 from edgefilter.diagnosis.select import refit, standing
@@ -39,7 +38,7 @@ def fit_straight(prepared: Straightened, wanted: Sequence[str]) -> tuple[EchoMod
     others. Looked for twice, since beside the wrong room it may be hidden.
     """
     followed = _followed(wanted)
-    start = _without(prepared.model, followed)
+    start = prepared.model.without_effect(*followed)  # the profile's own too: here they may have other values
     bench = Workbench(prepared, Criteria(), start=start)
     model = _straightened(bench, start, followed)
     fitted, order = _forward(bench, model, wanted)
@@ -79,14 +78,9 @@ def _followed(wanted: Sequence[str]) -> list[str]:
     return [name for name in names() if find(name).followed and name not in wanted and find(name).family not in left]
 
 
-def _without(model: EchoModel, followed: Sequence[str]) -> EchoModel:
-    """The model without the effects of these names, also where the profile holds them: in this recording they may have other values."""
-    return replace(model, effects=tuple(entry for entry in model.effects if entry[0] not in followed))
-
-
 def _straightened(bench: Workbench, model: EchoModel, followed: Sequence[str]) -> EchoModel:
     """The model with only those of the followed effects that held-out samples show: forward, refitted, backward."""
-    start = model = _without(model, followed)
+    start = model = model.without_effect(*followed)
     while True:
         absent = [name for name in followed if name not in dict(model.effects)]
         trials = [trial for name in absent if (trial := bench.attempt(name, model)) is not None]

@@ -13,8 +13,6 @@ from edgefilter.dsp.tones import tones
 from edgefilter.echo.measurement import whiten
 from edgefilter.types import SAMPLE_RATE, Array
 
-BLOCK = SAMPLE_RATE // 10
-
 
 @dataclass(frozen=True, eq=False)
 class Leftover:
@@ -37,8 +35,9 @@ def leftover(found: Found) -> Leftover:
     prepared, heard = found.in_noise, found.in_noise.measurement.recording
     residual, psd = (heard - found.final.prediction) / found.model.microphone_gain(heard.size), prepared.noise_psd
     strongest = tones(residual, psd)
-    quiet = blocks(prepared.usable & ~prepared.active, BLOCK).all(axis=1)
-    power = block_power(whiten(residual, psd), BLOCK)[quiet]
+    block = SAMPLE_RATE // 10
+    quiet = blocks(prepared.usable & ~prepared.active, block).all(axis=1)
+    power = block_power(whiten(residual, psd), block)[quiet]
     if power.size < 5:
         return Leftover(*strongest, float("nan"), 0.0)
     low, high = decibels(np.quantile(power, (0.1, 0.9)))

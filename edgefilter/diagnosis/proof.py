@@ -95,11 +95,7 @@ class HeldOut:
         self._early = replace(early.fitted_to(early.fit & before), usable=early.usable & before)
 
     def proof(self, names: Sequence[str]) -> Proof:
-        """The proof of effects, fitted to the first part as Recording.add does it.
-
-        A filter that begins with the rest, engine "linear", runs over it with the profile before and after. Where somebody
-        else talks is left out.
-        """
+        """The proof of effects, fitted to the first part as Recording.add does it: recording.prove."""
         before, after = self._left_before, self._left_with(names)
         erle_db = self.erle_db(before), self.erle_db(after)
         proof = Proof(tuple(names), self.cut / SAMPLE_RATE, self.seconds, *erle_db, before, after)

@@ -20,7 +20,7 @@ from edgefilter.dsp.psd import GRID_BINS, ROUNDING_PSD, coloured, floored, frequ
 from edgefilter.dsp.stft import StftConfig
 from edgefilter.echo.effect import STAGES
 from edgefilter.echo.effects.catalogue import find
-from edgefilter.echo.least_squares import normal_equations
+from edgefilter.echo.least_squares import fitted_taps
 from edgefilter.echo.measurement import Measurement, level_ratio
 from edgefilter.echo.model import EchoModel
 from edgefilter.echo.recording import BLOCK
@@ -240,8 +240,7 @@ class Straightened:
         """A prediction, also given whitened, through the filter, within TOLERANCE of 1, that brings it closest to the recording."""
         target, lead = self.measurement.white_recording - white, TOLERANCE_TAPS // 2
         rows = self.fit & self.usable & self.active & (np.arange(self.usable.size) % 3 == 0)
-        weights, _ = normal_equations([white], target, TOLERANCE_TAPS, lead, rows).solve(1e-5)
-        response = np.fft.rfft(weights[0], 256)
+        response = np.fft.rfft(fitted_taps(white, target, TOLERANCE_TAPS, lead, rows, 1e-5), 256)
         bounded = np.fft.irfft(response * np.minimum(1.0, TOLERANCE / np.maximum(np.abs(response), 1e-12)), 256)
         return prediction + filtered(prediction, np.roll(bounded, 96), 96 + lead)
 

@@ -183,11 +183,6 @@ class Effect:
         return self.adds_noise or self.stage == "noise"
 
     @property
-    def noise_is_asked(self) -> bool:
-        """Whether the running filter asks for variance()."""
-        return self.adds_noise and not self.followed
-
-    @property
     def timed(self) -> bool:
         """Whether what it does depends on when the recording began."""
         return self.event or self.stage == "time"

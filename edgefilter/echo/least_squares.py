@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -19,26 +18,6 @@ RIDGE = 1e-6
 """Of an unknown's own energy: keeps equations soluble, and changes no weight that is heard."""
 
 
-@dataclass(frozen=True, eq=False)
-class Normal:
-    """Normal equations of target(n) = sum over c and k of w[c, k] column_c(n + lead - k), summed over the chosen n.
-
-    matrix: (C * taps, C * taps) float64. right: (C * taps,). energy: of the target over these samples.
-    """
-
-    matrix: Array
-    right: Array
-    energy: float
-    taps: int
-
-    def solve(self, ridge: float = RIDGE) -> tuple[Array, float]:
-        """Weights (C, taps) float64 and the energy that they leave; ridge is relative to each column's own energy."""
-        own = np.repeat(self.matrix.diagonal().reshape(-1, self.taps).mean(axis=1), self.taps)
-        w = ridge_solved(self.matrix, self.right, ridge, own)
-        left = self.energy - 2.0 * float(w @ self.right) + float(w @ self.matrix @ w)
-        return w.reshape(-1, self.taps), max(left, 0.0)
-
-
 def ridge_solved(matrix: Array, right: Array, ridge: Array | float, energy: Array | None = None) -> Array:
     """Weights (k,) of normal equations (k, k), (k,); ridge, (k,) or one for all, is relative to energy (k,): by default each one's own."""
     scale = np.sqrt(matrix.diagonal() if energy is None else energy) + 1e-30
@@ -52,21 +31,30 @@ def at_lags(x: Samples, taps: int, lead: int) -> Samples:
 
 
 def normal_equations(
-    columns: Sequence[Samples], target: Samples, taps: int, lead: int = 0, fit: np.ndarray | None = None
-) -> Normal:
-    """Normal equations for columns (C, n), each at_lags(), and a target (n,); fit (n,) bool: the samples that count, None for all."""
-    n, size = target.size, len(columns) * taps
+    columns: Sequence[Samples], target: Samples, taps: int, lead: int, fit: np.ndarray | None
+) -> tuple[Array, Array]:
+    """Normal equations (C * taps, C * taps), (C * taps,) for columns (C, n), each at_lags(), and a target (n,).
+
+    fit (n,) bool: the samples that count, None for all.
+    """
+    size = len(columns) * taps
     windows = [at_lags(column, taps, lead) for column in columns]
-    matrix, right, energy = np.zeros((size, size)), np.zeros(size), 0.0
-    used = None if fit is None else np.flatnonzero(fit)
-    for at in range(0, n if used is None else used.size, CHUNK):
-        chosen = slice(at, at + CHUNK) if used is None else used[at : at + CHUNK]
+    matrix, right = np.zeros((size, size)), np.zeros(size)
+    used = np.arange(target.size) if fit is None else np.flatnonzero(fit)
+    for at in range(0, used.size, CHUNK):
+        chosen = used[at : at + CHUNK]
         rows = np.concatenate([w[chosen] for w in windows], axis=1)
-        y = target[chosen]
         matrix += rows.T @ rows
-        right += rows.T @ y
-        energy += float(np.dot(y, y))
-    return Normal(matrix, right, energy, taps)
+        right += rows.T @ target[chosen]
+    return matrix, right
+
+
+def fitted_taps(
+    x: Samples, target: Samples, taps: int, lead: int, fit: np.ndarray | None, ridge: float = RIDGE
+) -> Array:
+    """The filter (taps,) of x (n,) that comes closest to a target (n,); ridge is relative to the energy of x."""
+    matrix, right = normal_equations([x], target, taps, lead, fit)
+    return ridge_solved(matrix, right, ridge, np.full(taps, matrix.diagonal().mean()))
 
 
 def hats(x: Array, knots: Array, beyond: bool = False) -> Array:
@@ -85,5 +73,5 @@ def hats(x: Array, knots: Array, beyond: bool = False) -> Array:
 
 def absorbed(predicted: Samples, target: Samples, fit: np.ndarray | None = None) -> Samples:
     """Put predicted (n,) through the short filter that brings it closest to target (n,): what is left is not ordinary."""
-    weights, _ = normal_equations([predicted], target, NUISANCE_TAPS, NUISANCE_LEAD, fit).solve()
-    return filtered(predicted, weights[0], NUISANCE_LEAD)
+    taps = fitted_taps(predicted, target, NUISANCE_TAPS, NUISANCE_LEAD, fit)
+    return filtered(predicted, taps, NUISANCE_LEAD)

@@ -38,13 +38,13 @@ class EchoModel:
     def predict(self, reference: Samples) -> Samples:
         """The robot's voice at the microphone (n,) for an aligned reference (n,), all effects applied."""
         ahead, paths, lead, behind = self._chain
-        x, n = _through(ahead, reference), reference.size
+        x, n = through(ahead, reference), reference.size
         played = np.zeros(n, np.float32)
         for path, changing in paths:
             heard = filtered(x, path, lead)
             share = None if changing is None else changing[0].share(changing[1], n, SAMPLE_RATE)
             played += heard if share is None else share * heard
-        return _through(behind, played)
+        return through(behind, played)
 
     @property
     def as_filter(self) -> tuple[Samples, int] | None:
@@ -67,7 +67,7 @@ class EchoModel:
         filters = list(takewhile(lambda pair: pair[0].absorbed, behind))
         if not filters:
             return ahead, paths, 0, behind
-        whole = [(_trimmed(_through(filters, np.pad(each, (LEAD, LONGEST)))), changing) for each, changing in paths]
+        whole = [(_trimmed(through(filters, np.pad(each, (LEAD, LONGEST)))), changing) for each, changing in paths]
         return ahead, whole, LEAD, behind[len(filters) :]
 
     @property
@@ -85,7 +85,7 @@ class EchoModel:
         """The impulse response behind effects, up to the last tap that exceeds that share of its largest, (taps,)."""
         if not effects:
             return self.impulse_response
-        response = _through(effects, np.pad(self.impulse_response, (0, LONGEST)))
+        response = through(effects, np.pad(self.impulse_response, (0, LONGEST)))
         return response[: max(self.impulse_response.size, _heard(response, share))]
 
     def over(self, response: Samples) -> EchoModel:
@@ -99,7 +99,7 @@ class EchoModel:
         if not noisy:
             return ()
         moved = [(e, v) for e, v in applied if e.stage == "time" or (e.stage == "source" and not e.adds_noise)]
-        x = _through(moved, reference)
+        x = through(moved, reference)
         added = [(effect.variance(x, values, SAMPLE_RATE), effect.colour(values)) for effect, values in noisy]
         return tuple(source for each in added for source in zip(*map(np.atleast_2d, each), strict=True))
 
@@ -114,9 +114,9 @@ class EchoModel:
         The effects that are filters are in its impulse response, and no longer listed.
         """
         rest = self.running_response()[response.size :] * np.float32(gain)
-        folded = {effect.name for effect, values in chain(self.effects) if is_filter(effect, values)}
-        kept = self._with_those(lambda name, values: name not in folded)
-        return replace(kept, impulse_response=np.concatenate((response, rest)).astype(np.float32))
+        folded = (effect.name for effect, values in chain(self.effects) if is_filter(effect, values))
+        whole = np.concatenate((response, rest)).astype(np.float32)
+        return replace(self.without_effect(*folded), impulse_response=whole)
 
     def components(self, reference: Samples) -> dict[str, Samples]:
         """What each part contributes to predict(reference), (n,) each: "linear", the path alone, then the change by each effect in turn."""
@@ -131,7 +131,7 @@ class EchoModel:
     def microphone_gain(self, size: int) -> Samples:
         """The gain that effects behind the microphone give voice and fan alike at each moment, (size,), ones without any."""
         scaling = [(effect, values) for effect, values in chain(self.effects) if effect.scales_fan]
-        return _through(scaling, np.ones(size, np.float32))
+        return through(scaling, np.ones(size, np.float32))
 
     def fan(self, noise: Samples) -> Samples:
         """The fan's sound (n,) in this recording, from one (n,) like that at its end; noise itself where it never changes."""
@@ -177,9 +177,9 @@ class EchoModel:
             model = model.with_effect(name, values[name])
         return model
 
-    def without_effect(self, name: str) -> EchoModel:
-        """The model without that effect."""
-        return self._with_those(lambda other, _: other != name)
+    def without_effect(self, *names: str) -> EchoModel:
+        """The model without those effects."""
+        return self._with_those(lambda name, _: name not in names)
 
     def _with_those(self, kept: Callable[[str, Values], bool]) -> EchoModel:
         """Only those effects; the model itself where that is all, so that what is remembered of it is found again."""
@@ -200,9 +200,8 @@ class EchoModel:
             before = takewhile(lambda pair: pair[0] is not effect, chain((*self.effects, (name, {}))))
             ahead = [pair for pair in before if pair[0].stage == "source"]
             if ahead:
-                behind = replace(measurement, reference=_through(ahead, measurement.reference))
-            for other, _ in ahead:
-                model = model.without_effect(other.name)
+                behind = replace(measurement, reference=through(ahead, measurement.reference))
+            model = model.without_effect(*(other.name for other, _ in ahead))
         values = complete(effect, effect.fit(behind, model))
         if RECORDING in effect.parameters and not vanishes(effect, values):
             values[RECORDING.name] = measurement.fingerprint
@@ -239,7 +238,7 @@ class EchoModel:
         return self if same else replace(self, effects=effects)
 
 
-def _through(effects: Chain, x: Samples) -> Samples:
+def through(effects: Chain, x: Samples) -> Samples:
     """A signal (n,) behind effects, (n,)."""
     for effect, values in effects:
         x = effect.apply(x, values, SAMPLE_RATE)

@@ -34,37 +34,32 @@ class SourceChain:
     """
 
     def __init__(self, effects: Sequence[tuple[str, Values]] = ()) -> None:
-        applied = chain(effects)
-        self._makers = [
-            (
-                partial(ExpectedSquare, effect, values, effect.memory or 0) if effect.noise_is_asked else None,
-                stream_form(effect, values) if effect.stage == "source" else None,
-            )
-            for effect, values in applied
-        ]
-        self.colours: list[Array] = [effect.colour(values) for effect, values in applied if effect.noise_is_asked]
+        self._makers: list[Callable[[], Runner]] = []
+        self.colours: list[Array] = []
         self.expected: list[Samples] = []
-        self._links = self._new_links()
-        self.memory = LONG_MEMORY if any(run and not isinstance(run, Windowed) for _, run in self._links) else 0
-
-    def _new_links(self) -> list[tuple[ExpectedSquare | None, Runner | None]]:
-        """Of each effect the noise that it adds and what it does to the signal, as before the first sample."""
-        return [(noise() if noise else None, run() if run else None) for noise, run in self._makers if noise or run]
+        for effect, values in chain(effects):
+            if effect.adds_noise and not effect.followed:
+                self._makers.append(partial(ExpectedSquare, effect, values, effect.memory or 0))
+                self.colours.append(effect.colour(values))
+            if effect.stage == "source" and (make := stream_form(effect, values)):
+                self._makers.append(make)
+        self._links = [make() for make in self._makers]
+        self.memory = 0 if all(isinstance(link, Windowed) for link in self._links) else LONG_MEMORY
 
     def __call__(self, block: Samples) -> Samples:
         """Put a block (n,) through the effects; it follows the last one."""
         if self.colours:
             self.expected = []
-        for noise, run in self._links:
-            if noise:
-                self.expected.append(noise(block))
-            if run:
-                block = run(block)
+        for link in self._links:
+            if isinstance(link, ExpectedSquare):
+                self.expected.append(link(block))
+            else:
+                block = link(block)
         return block
 
     def restart(self, past: Samples) -> Samples:
         """Put another past (n,) through the effects, in place of the one that was; the next block follows it."""
-        self._links = self._new_links()
+        self._links = [make() for make in self._makers]
         return self(past)
 
 

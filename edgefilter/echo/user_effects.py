@@ -24,8 +24,6 @@ from edgefilter.types import SAMPLE_RATE
 REQUIRED = ("name", "stage", "parameters", "fit")
 """What no effect can do without; the rest has the defaults of Effect."""
 HOOKS = [name for name, hook in {**vars(Effect), **vars(Shift)}.items() if callable(hook) and not name.startswith("_")]
-PROBE_SAMPLES = 4000
-"""Of noise, on which neutral values must change nothing: a quarter of a second."""
 _loaded: dict[Path, str] = {}
 
 
@@ -220,7 +218,7 @@ def _wrong(effect: Effect) -> str:
     for p in effect.parameters:
         if not p.low <= p.neutral <= p.high:
             return f"neutral {p.name}={p.neutral:g} is outside {p.low:g} to {p.high:g}"
-    probe = np.random.default_rng(0).standard_normal(PROBE_SAMPLES).astype(np.float32) * np.float32(0.1)
+    probe = np.random.default_rng(0).standard_normal(SAMPLE_RATE // 4).astype(np.float32) * np.float32(0.1)
     probe.flags.writeable = False
     if float(np.max(np.abs(effect.apply(probe, neutral(effect), SAMPLE_RATE) - probe))) > 1e-5:
         return f"apply changes the signal at the neutral values of effect '{effect.name}', expected the identity there"

@@ -15,6 +15,7 @@ from scipy.ndimage import uniform_filter1d
 from edgefilter.dsp.convolution import filtered
 from edgefilter.dsp.fourier import power
 from edgefilter.dsp.frames import decibels
+from edgefilter.dsp.psd import frequencies
 from edgefilter.echo.effect import Effect, Parameter, complete, first, neutral, numbers
 from edgefilter.echo.effects.knock_power import BAND_HZ, BANDS, band_power, frames_to_fit
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel, level_ratio
@@ -142,7 +143,10 @@ class Bandlimit(Effect):
 
     def only(self, values: Values) -> Values:
         """The band that is passed as it was, where one gain is all that happens to it."""
-        hz, gain_db = measured_response_db(values)
+        impulse = np.zeros(2 * FFT, np.float32)
+        impulse[FFT] = 1.0
+        hz = frequencies(FFT + 1)
+        gain_db = 20.0 * np.log10(np.abs(fft.rfft(self.apply(impulse, values, SAMPLE_RATE))) + 1e-6)
         passed = gain_db[(hz > PASSED_HZ) & (hz < 0.6 * float(values["cutoff_hz"]))]
         if not passed.size or float(np.std(passed)) > FLAT_DB:
             return values
@@ -210,11 +214,3 @@ def low_pass(hz: Array, cutoff: float, order: float, phase: float) -> NDArray[np
     angle = -np.sum(np.angle(1j * ratio[:, None] - poles), axis=1) + np.sum(np.angle(-poles))
     delay = -np.sum((1.0 / poles).real)
     return magnitude * np.exp(1j * phase * (angle + delay * ratio))
-
-
-def measured_response_db(values: Values) -> tuple[Array, Array]:
-    """Frequencies (FFT + 1,) Hz and gain in dB of the fitted low-pass, with its taps."""
-    impulse = np.zeros(2 * FFT, np.float32)
-    impulse[FFT] = 1.0
-    response = np.abs(fft.rfft(Bandlimit().apply(impulse, values, SAMPLE_RATE)))
-    return np.arange(FFT + 1) * SAMPLE_RATE / (2 * FFT), 20.0 * np.log10(response + 1e-6)

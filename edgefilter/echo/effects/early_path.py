@@ -16,9 +16,8 @@ WITHIN = 0.8
 class EarlyPath(AddedResponse):
     """h + added: another impulse response, after which the room dies away as it did.
 
-    added: (k,) from h's first tap on. level_db: its energy re that of h. within_ms: the lag behind the direct sound by
-    which WITHIN of it has come. It is as long as that of late_reverb: where the microphone is another, so is each
-    reflection. taps: as there.
+    level_db: energy of what is added re that of h. within_ms: the lag behind the direct sound by which WITHIN of it has
+    come. It is as long as that of late_reverb: where the microphone is another, so is each reflection.
     """
 
     name = "early_path"

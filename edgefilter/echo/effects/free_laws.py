@@ -100,8 +100,8 @@ class _Ground:
 
     def solve(self, parts: Sequence[Samples], bends: Array) -> Array:
         """Least-squares weights of x's parts (k, n), their bends (m, k) held small; (k,)."""
-        normal = normal_equations([self.part(part) for part in parts], self.target, 1, 0, self.weights > 0.0)
-        return _solved(normal.matrix, normal.right, bends)[0]
+        heard = [self.part(part) for part in parts]
+        return _solved(*normal_equations(heard, self.target, 1, 0, self.weights > 0.0), bends)[0]
 
     def sums(self, step: int) -> tuple[Array, Array]:
         """Of each `step` samples of x the energy that they have at the microphone, and their product with the recording."""
@@ -171,9 +171,9 @@ class Times:
 
     attack_ms: float
     release_ms: float
-    ahead_ms: int = 0
-    peak: bool = False
-    exponent: float = 1.0
+    ahead_ms: int
+    peak: bool
+    exponent: float
 
 
 class FreeGain(FreeLaw):
@@ -216,7 +216,7 @@ class FreeGain(FreeLaw):
             known.update(zip(new, map(worth, _levels(x, new), new), strict=True))
             return max(settings, key=known.__getitem__)
 
-        times, known = Times(1.0, 1.0), dict[Times, float]()
+        times, known = Times(1.0, 1.0, 0, False, 1.0), dict[Times, float]()
         for _ in range(2):
             times = best([replace(times, attack_ms=a, release_ms=r) for a, r in product(ATTACKS_MS, RELEASES_MS)])
             for ratio in FINER:

@@ -78,17 +78,17 @@ class GainFit:
         left = self._target - rows @ self._weights(rows, self._target)
         self.without, self._heard_plain = float(left @ left), self._target - left
 
-    def best(self, starts: Sequence[Array]) -> tuple[Array, float] | None:
-        """The unknowns with the smallest residual, and its energy; None if they lower it by less than Bayes' criterion asks (Schwarz 1978)."""
+    def best(self, starts: Sequence[Array]) -> Array | None:
+        """The unknowns with the smallest residual; None if they lower its energy by less than Bayes' criterion asks (Schwarz 1978)."""
         reach = self._reach
         starts = [np.clip(start, reach.lowest, reach.highest) for start in starts]
-        costs = [self.cost(start) for start in starts]
+        costs = [float(left @ left) for left in map(self._residual, starts)]
         best, cost = starts[int(np.argmin(costs))], min(costs)
         if self.loud_db > reach.lowest[0] and cost < self.without:
             best, cost = reach.solved(self._residual, self._slopes, best)
         count = max(self._chosen.size, 2)
         worth = best.size * np.log(count) * cost / count
-        return (best, cost) if self.without - cost > worth else None
+        return best if self.without - cost > worth else None
 
     def roughly(self, gain: Callable[[Array], Array], starts: Sequence[Array]) -> list[Array]:
         """The best of some starts, and the same after a quick least-squares fit of one gain per STEP; gain(unknowns): (steps,).
@@ -114,11 +114,6 @@ class GainFit:
         starts = [np.clip(start, self._reach.lowest, self._reach.highest) for start in starts]
         best = min(starts, key=lambda start: float(np.sum(left(start) ** 2)))
         return [best, self._reach.solved(left, slopes, best)[0]]
-
-    def cost(self, unknowns: Array) -> float:
-        """Energy of the residual with these unknowns, over the excerpt."""
-        left = self._residual(unknowns)
-        return float(left @ left)
 
     def gains(self, unknowns: Array) -> Array:
         """Least-squares gain of each part over the whole recording, (parts,)."""
@@ -194,8 +189,8 @@ def fit_one(
     found = fit.best(fit.roughly(gain, [np.array((fit.loud_db + above, *others)) for above, *others in starts]))
     if found is None:
         return neutral(effect)
-    makeup_db = 20.0 * np.log10(max(float(fit.gains(found[0])[0]), 1e-2))
-    return within(effect, {**values_of(found[0]), "makeup_db": makeup_db})
+    makeup_db = 20.0 * np.log10(max(float(fit.gains(found)[0]), 1e-2))
+    return within(effect, {**values_of(found), "makeup_db": makeup_db})
 
 
 def excerpt(measurement: Measurement, model: VoiceModel, size: int) -> slice:

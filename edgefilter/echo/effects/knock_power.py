@@ -25,8 +25,6 @@ RESONANCES_HZ, Q = (120.0, 160.0, 210.0, 280.0, 370.0), 1.0
 """Of the membranes whose displacement is tried as the trigger."""
 SHARES = (0.3, 0.45, 0.6, 0.7, 0.8, 0.88, 0.94)
 """Thresholds to try, as the share of the displacement's peaks that stay below."""
-SIDES = (1.0, -1.0, 0.0)
-"""Only pushes knock, only pulls, both."""
 DECAYS_MS = (4.0, 1.0, 2.0, 8.0, 16.0, 32.0)
 """Of what follows a knock: the first is taken while the trigger is looked for."""
 BETTER, LEAST = 3.0, 150.0
@@ -72,7 +70,7 @@ def find_trigger(
         sides = rises(moved, min(thresholds))
         for threshold in thresholds:
             outward, inward = (_roughly_ringing(knocks_in(rising, threshold), x.size) for rising in sides)
-            for side in SIDES:
+            for side in (1.0, -1.0, 0.0):
                 source = one_side((outward, inward), side)
                 source = source / (source.mean() + np.float32(1e-30))
                 sources = [one[use], source[use]]

@@ -11,8 +11,6 @@ from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import LONGEST, fit_filter, fit_supported
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Array, Samples
 
-LEAD = 32
-"""Taps before lag 0 of the filter that profiles of earlier versions hold."""
 EXPECTED = 1e-3
 """Expected square of a tap before anything is known of the room, the same at all lags."""
 SLOWER = 1.7
@@ -33,23 +31,28 @@ ADDED = Parameter("added", "1", 0.0, -1e3, 1e3), Parameter("taps", "1", 0.0, -10
 
 
 class AddedResponse(Effect):
-    """h + added, what `added` (k,) holds from h's first tap on, of a flexible effect on the impulse response."""
+    """h + added, a flexible effect on the impulse response. added: (k,) from h's first tap on.
 
+    taps: (k,) lags -lead to k - lead, a filter behind h, in profiles of earlier versions.
+    """
+
+    lead = 32
     stage = "response"
     family = "linear path"
     complexity = 4
     flexible = True
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        return with_added(x, values)
+        added, y = numbers(values, "added")[: x.size], x + filtered(x, numbers(values, "taps"), self.lead)
+        y[: added.size] += added.astype(np.float32)
+        return y
 
 
 class LateReverb(AddedResponse):
     """h + added: another impulse response, that of a longer room. Its decay gives the reverberation time.
 
     rt60_s: from the backward-integrated energy of the whole new response (Schroeder 1965, eq. 5), the first 20 ms left
-    out, above the noise. level_db: energy of what is added from 10 ms after the direct sound on, re that of h. added:
-    (k,) from h's first tap on. taps: (k,) lags -LEAD to k - LEAD, a filter behind h, in profiles of earlier versions.
+    out, above the noise. level_db: energy of what is added from 10 ms after the direct sound on, re that of h.
     """
 
     name = "late_reverb"
@@ -79,16 +82,6 @@ class LateReverb(AddedResponse):
         added = numbers(values, "added").copy()
         added[: PRE_ROLL + DIRECT] = 0.0
         return {**values, "added": added}
-
-
-def with_added(response: Samples, values: Values, lead: int = LEAD) -> Samples:
-    """The response (k,) with what is added to it, or what a filter behind it adds, its taps from lag -lead on, (k,)."""
-    added, changed = (
-        numbers(values, "added")[: response.size],
-        response + filtered(response, numbers(values, "taps"), lead),
-    )
-    changed[: added.size] += added.astype(np.float32)
-    return changed
 
 
 def fit_path(measurement: Measurement, model: VoiceModel) -> tuple[Array, float, bool]:

@@ -58,10 +58,8 @@ class MicClipping(Effect):
 
         total = float(np.dot(recording * chosen, recording * chosen))
         plain = left(NEVER_REACHED, HARD)
-        levels = top * STEPS
-        costs = [left(level, HARD) for level in levels]
-        best = int(np.argmin(costs))
-        found = (costs[best], float(levels[best]), HARD)
+        least, level = min(((left(level, HARD), level) for level in top * STEPS), key=lambda tried: tried[0])
+        found = (least, float(level), HARD)
         for hardness in HARDNESS:
             for factor in (0.85, 1.0, 1.15):
                 level = min(found[1] * factor, 0.99 * NEVER_REACHED)

@@ -85,8 +85,8 @@ class MultibandCompression(Effect):
         found = fit.best([_start(fit.loud_db, *start) for start in STARTS])
         if found is None:
             return neutral(self)
-        makeup_db = np.clip(20.0 * np.log10(np.maximum(fit.gains(found[0]), 1e-2)), -MOST_DB, MOST_DB)
-        return {**filters, **_values(found[0]), "delay": delay, "makeup_db": makeup_db}
+        makeup_db = np.clip(20.0 * np.log10(np.maximum(fit.gains(found), 1e-2)), -MOST_DB, MOST_DB)
+        return {**filters, **_values(found), "delay": delay, "makeup_db": makeup_db}
 
     def sentence(self, values: Values) -> str:
         """The compression ratio of each band, for the report."""

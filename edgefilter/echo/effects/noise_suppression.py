@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import scipy
 from numpy.typing import NDArray
@@ -89,19 +91,19 @@ class NoiseSuppression(Effect):
         if measurement.noise_psd is None:
             return neutral(self)
         voice = measurement.predicted(model)[0]
-        cells = Cells(measurement, voice, measurement.weights > 0.0)
-        if cells.quiet_db > -LEAST_SOFTER_DB:
+        quiet_db, (ratio_db, power, cross) = _cells(measurement, measurement.noise_psd, voice)
+        if quiet_db > -LEAST_SOFTER_DB:
             return neutral(self)
-        *parts, last = hats(cells.ratio_db, KNOTS_DB)
+        *parts, last = hats(ratio_db, KNOTS_DB)
         knots = len(parts)
-        step, right = (np.eye(knots) - np.eye(knots, k=1)) / TRUST, parts @ (cells.cross - last * cells.power)
+        step, right = (np.eye(knots) - np.eye(knots, k=1)) / TRUST, parts @ (cross - last * power)
         right[-1] += TRUST**-2
-        left = step.T @ step + (parts * cells.power) @ np.transpose(parts)
+        left = step.T @ step + (parts * power) @ np.transpose(parts)
         gain_db = 20.0 * np.log10(np.clip(np.linalg.solve(left, right), 1e-3, 3.9))
         if gain_db[0] > -LEAST_SOFTER_DB:
             return neutral(self)
         fan_db = 10.0 * np.log10(floored(measurement.noise_psd))
-        return within(self, {"gain_db": gain_db, "fan_db": fan_db, "softer_db": cells.quiet_db})
+        return within(self, {"gain_db": gain_db, "fan_db": fan_db, "softer_db": quiet_db})
 
     def sentence(self, values: Values) -> str:
         at = dict(zip(KNOTS_DB.astype(int).tolist(), numbers(values, "gain_db", KNOTS_DB.size - 1), strict=False))
@@ -112,36 +114,28 @@ class NoiseSuppression(Effect):
         )
 
 
-class Cells:
-    """A recording and its predicted voice in the cells that lie wholly in the samples `among` (n,) bool; the fan's power in each is 1.
+def _cells(measurement: Measurement, noise_psd: Samples, voice: Samples) -> tuple[float, Array]:
+    """Level of the recording while the robot is silent, 0 where that is too seldom; of the cells to fit to three figures, (3, cells).
 
-    ratio_db: of voice to fan. power: of the voice as loud cells of its band have it. cross: of that and the recording, real
-    part; all (cells,). quiet_db: level of the recording while the robot is silent, of all samples, 0 where that is too
-    seldom.
+    The ratio of voice to fan in dB, and, the fan's power in each taken as 1, the power of the voice as loud cells of its
+    band have it, and the product of that voice and the recording, real part.
     """
-
-    def __init__(self, measurement: Measurement, voice: Samples, among: NDArray[np.bool_]) -> None:
-        assert measurement.noise_psd is not None
-        fan = variance_at(frequencies(SIZE // 2 + 1), floored(measurement.noise_psd))
-        whole = frames(among, SIZE, HOP).all(axis=1)
-        x, y = (_spectra(signal) for signal in (voice, measurement.recording))
-        local_db = decibels(_ratio(x, fan)[whole])
-        x, y = (spectra / np.sqrt(HOP * fan) for spectra in (x, y))
-        self.quiet_db = _quiet_db(x, y)
-        x, y = x[whole], y[whole]
-        ratio_db, power, cross = [], [], []
-        for low, high in zip(EDGES[:-1], EDGES[1:], strict=True):
-            own, both = np.abs(x[:, low:high]) ** 2, (np.conj(x[:, low:high]) * y[:, low:high]).real
-            level = local_db[:, low:high]
-            loud = level > LOUD_DB
-            scale = float(both[loud].sum() / own[loud].sum()) if loud.sum() >= FEWEST_LOUD else 0.0
-            if scale > 0.0:
-                ratio_db.append(level.ravel())
-                power.append(scale**2 * own.ravel())
-                cross.append(scale * both.ravel())
-        self.ratio_db, self.power, self.cross = (
-            np.concatenate(parts) if parts else np.zeros(0) for parts in (ratio_db, power, cross)
-        )
+    fan = variance_at(frequencies(SIZE // 2 + 1), floored(noise_psd))
+    whole = frames(measurement.weights, SIZE, HOP).all(axis=1)
+    x, y = (_spectra(signal) for signal in (voice, measurement.recording))
+    local_db = decibels(_ratio(x, fan)[whole])
+    x, y = (spectra / np.sqrt(HOP * fan) for spectra in (x, y))
+    quiet_db = _quiet_db(x, y)
+    x, y = x[whole], y[whole]
+    found = [np.zeros((3, 0))]
+    for low, high in pairwise(EDGES):
+        own, both = np.abs(x[:, low:high]) ** 2, (np.conj(x[:, low:high]) * y[:, low:high]).real
+        level = local_db[:, low:high]
+        loud = level > LOUD_DB
+        scale = float(both[loud].sum() / own[loud].sum()) if loud.sum() >= FEWEST_LOUD else 0.0
+        if scale > 0.0:
+            found.append(np.stack((level.ravel(), scale**2 * own.ravel(), scale * both.ravel())))
+    return quiet_db, np.concatenate(found, axis=1)
 
 
 def _quiet_db(x: NDArray[np.complex128], y: NDArray[np.complex128]) -> float:

@@ -7,30 +7,25 @@ import numpy as np
 from edgefilter.dsp.convolution import filtered
 from edgefilter.dsp.frames import block_power
 from edgefilter.echo.effect import NEVER_S, Parameter, first, neutral, within
-from edgefilter.echo.effects.late_reverb import ADDED, AddedResponse, beside, with_added
+from edgefilter.echo.effects.late_reverb import ADDED, AddedResponse, beside
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
 from edgefilter.echo.wiener import fit_supported
 from edgefilter.types import PRE_ROLL, SAMPLE_RATE, Samples
 
 TAPS, EXPECTED = 3072, 1e-2
 """Of what is added, 0.2 s; and the expected square of each, re the energy of the calibrated response."""
-BLOCK = SAMPLE_RATE // 10
-"""Step of the first, coarse search for the moment of the change, samples (100 ms)."""
 MARGIN = 1.5
 """Seconds at either end in which no change is looked for: it looks like a path that was another all along."""
 
 
 class PathChange(AddedResponse):
-    """h until time_s, then h + added, faded over in duration_s around it; a time_s of 1e6 s is never.
-
-    added: (k,) from h's first tap on. taps: (k,) lags -PRE_ROLL to k - PRE_ROLL, a filter behind h, in profiles of earlier
-    versions.
-    """
+    """h until time_s, then h + added, faded over in duration_s around it; a time_s of 1e6 s is never."""
 
     name = "path_change"
     run_note = "the running filter begins with the path as it was after the change"
     title = "a changed path"
     event = True
+    lead = PRE_ROLL
     parameters = (
         Parameter("time_s", "s", NEVER_S, 0.0, NEVER_S),
         Parameter("duration_s", "s", 0.01, 0.0, 10.0),
@@ -39,7 +34,7 @@ class PathChange(AddedResponse):
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
         """The new response, that of after the change."""
-        return with_added(x, values, PRE_ROLL) if float(values["time_s"]) < NEVER_S else x.copy()
+        return super().apply(x, values, sample_rate) if float(values["time_s"]) < NEVER_S else x.copy()
 
     def share(self, values: Values, size: int, sample_rate: int) -> Samples:
         return _fade(size, float(values["time_s"]), float(values["duration_s"]), sample_rate)
@@ -87,13 +82,14 @@ def _fade(n: int, time: float, duration: float, sample_rate: int) -> Samples:
 
 
 def _step(residual: Samples, x: Samples) -> float:
-    """Seconds at which the residual, in proportion to the prediction, rises most clearly: two means of its log in BLOCKs."""
-    power, drive = block_power(residual, BLOCK), block_power(x, BLOCK)
+    """Seconds at which the residual, in proportion to the prediction, rises most clearly: two means of its log in steps of 0.1 s."""
+    block = SAMPLE_RATE // 10
+    power, drive = block_power(residual, block), block_power(x, block)
     count = power.size
     loud = drive > 10.0
     ratio = np.where(loud, np.log(np.maximum(power, 1.0) / np.where(loud, drive, 1.0)), 0.0)
     total, number = np.cumsum(ratio * loud), np.cumsum(loud)
-    first = max(int(MARGIN * SAMPLE_RATE / BLOCK), 1)
+    first = int(MARGIN * SAMPLE_RATE / block)
     best, at = -np.inf, count // 2
     for k in range(first, count - first):
         before, after = number[k - 1], number[-1] - number[k - 1]
@@ -103,4 +99,4 @@ def _step(residual: Samples, x: Samples) -> float:
         score = rise * np.sqrt(before * after / (before + after))
         if score > best:
             best, at = score, k
-    return at * BLOCK / SAMPLE_RATE
+    return at * block / SAMPLE_RATE
