@@ -22,6 +22,7 @@ from edgefilter.dsp.fractional_delay import delayed
 from edgefilter.dsp.frames import decibels
 from edgefilter.dsp.psd import GRID_BINS, coloured, frequencies
 from edgefilter.echo.effects.catalogue import find
+from edgefilter.echo.effects.gain_fit import loudest
 from edgefilter.echo.measurement import Measurement
 from edgefilter.echo.model import EchoModel
 from edgefilter.errors import SignalError, UsageError
@@ -369,10 +370,8 @@ def _noise(rng: np.random.Generator, magnitude: Array, level: float, peak: float
 
 def _loudest(reference: Samples, n: int) -> Array:
     """The loudest stretch of a reference, (n,), faded in and out, with silence behind a shorter one."""
-    x = np.pad(reference.astype(np.float64), (0, max(n + 1 - reference.size, 0)))
-    energy = np.concatenate(([0.0], np.cumsum(x**2)))
-    at = int(np.argmax(energy[n:] - energy[:-n]))
-    return _faded(x[at : at + n])
+    x = np.pad(reference.astype(np.float64), (0, max(n - reference.size, 0)))
+    return _faded(x[loudest(x, np.ones(x.size, bool), n)])
 
 
 def _faded(x: Array) -> Array:

@@ -227,8 +227,8 @@ class Workbench:
 
     def attempt_last(self, model: EchoModel) -> list[Trial]:
         """Try each of the last resorts that the model lacks."""
-        resorts = (self.attempt(name, model) for name in self.absent(model) if find(name).last_resort)
-        return [trial for trial in resorts if trial is not None]
+        resorts = (name for name in self.absent(model) if find(name).last_resort)
+        return [trial for name in resorts if (trial := self.attempt(name, model))]
 
     def filtered_ahead(self, model: EchoModel) -> EchoModel | None:
         """The model in which one filter ahead of the loudspeaker replaces those behind it; the room is refitted. None if no filter is behind it."""

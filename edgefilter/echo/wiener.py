@@ -138,6 +138,11 @@ class Spectra:
     fan: float
     averaged: int
 
+    def earlier(self, delays: Array) -> Array:
+        """The cross-spectrum with a recording that is so many samples (d,) earlier, real parts before imaginary ones, (2 m, d)."""
+        turned = self.cross[:, None] * np.exp(2j * np.pi * np.outer(self.hz, delays) / SAMPLE_RATE)
+        return np.concatenate((turned.real, turned.imag))
+
 
 def spectra(measurement: Measurement, model: VoiceModel, resolution_hz: float = 20.0) -> Spectra:
     """Auto- and cross-spectra of a model's whitened prediction and the recording over the fit samples, averaged over bands of resolution_hz."""

@@ -14,7 +14,7 @@ from scipy import ndimage, signal
 
 from edgefilter import add, compare, load_effect
 from edgefilter.diagnosis.criteria import Criteria
-from edgefilter.diagnosis.findings import findings_of
+from edgefilter.diagnosis.diagnose import findings_of
 from edgefilter.diagnosis.laws import Curve, Law, law_of, with_laws
 from edgefilter.diagnosis.prepare import prepare
 from edgefilter.diagnosis.recording import diagnose

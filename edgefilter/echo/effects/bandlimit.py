@@ -93,8 +93,7 @@ class Bandlimit(Effect):
         """
         predicted, x = measurement.predicted(model)
         found = spectra(measurement, model)
-        turned = found.cross[:, None] * np.exp(2j * np.pi * np.outer(found.hz, DELAYS) / SAMPLE_RATE)
-        turned = np.concatenate((turned.real, turned.imag))
+        turned = found.earlier(DELAYS)
 
         def best_of(filters: Sequence[Filter], responses: NDArray[np.complex128]) -> tuple[Filter, float]:
             """The filter, and its delay, that makes the squared error least, at whichever gain."""

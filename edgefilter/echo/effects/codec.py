@@ -71,7 +71,6 @@ class Codec(Effect):
     family = "additive noise"
     run_note = "the running filter follows by itself what noise the voice brings along: adding it changes nothing there"
     title = "a codec"
-    complexity = 3
     followed = True
     parameters = (
         Parameter("power", "full scale^2", 0.0, 0.0, 1e3),

@@ -97,8 +97,7 @@ def _basis(bins: int, sample_rate: int, knots: int) -> NDArray[np.complex128]:
 
 def _smooth_gain(found: Spectra) -> tuple[Array, float]:
     """Nepers at the knots (k,) and delay of the response that explains most of the cross-spectrum."""
-    turns = np.exp(-2j * np.pi * np.outer(found.hz, DELAYS) / SAMPLE_RATE)
-    delay = float(DELAYS[int(np.argmax((found.cross @ turns.conj()).real))])
+    delay = float(DELAYS[int(np.argmax(found.earlier(DELAYS)[: found.hz.size].sum(axis=0)))])
     whole = _basis(FFT // 2 + 1, SAMPLE_RATE, KNOTS)
     at = np.clip(np.rint(found.hz * FFT / SAMPLE_RATE).astype(int), 0, FFT // 2)
     basis = np.concatenate((whole[at], -2j * np.pi * found.hz[:, None] / SAMPLE_RATE), axis=1)

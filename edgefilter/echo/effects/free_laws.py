@@ -12,7 +12,7 @@ import numpy as np
 
 from edgefilter.dsp.convolution import filtered
 from edgefilter.dsp.frames import block_power, block_sums, blocks, decibels
-from edgefilter.echo.effect import Effect, Parameter, Runner, Shift, Stage, first, neutral, numbers, vanishes, within
+from edgefilter.echo.effect import Effect, Parameter, Runner, Shift, Stage, first, neutral, numbers, within
 from edgefilter.echo.effects.gain_fit import EXCERPT, STEP, loudest
 from edgefilter.echo.least_squares import at_lags, hats, normal_equations
 from edgefilter.echo.measurement import Measurement, Values, VoiceModel
@@ -127,8 +127,6 @@ class FreeCurve(FreeLaw):
     knots: ClassVar[Array] = np.concatenate((-SHARES[::-1], [0.0], SHARES))
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        if vanishes(self, values):
-            return x.copy()
         peak, shares = first(values, "peak"), self.knots
         ends = np.concatenate(([-5.0], shares, [5.0]))
         bend = numbers(values, "bend", shares.size)

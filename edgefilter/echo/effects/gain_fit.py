@@ -144,15 +144,14 @@ class GainFit:
         gains = weights.reshape(len(sounds), TAPS).sum(axis=1)
         here, moved = gains @ np.stack(sounds), np.empty((self._chosen.size, unknowns.size), np.float32)
         for column, (there, step) in zip(moved.T, self._reach.moved(unknowns), strict=True):
-            column[:] = self._heard((gains @ np.stack(self._make(self.x, there)) - here) / step)[self._chosen]
+            change = (gains @ np.stack(self._make(self.x, there)) - here) / step
+            column[:] = self._measurement.heard(self._model, change)[self._chosen]
         return rows @ self._weights(rows, moved) - moved
-
-    def _heard(self, sound: Samples) -> Samples:
-        return self._measurement.heard(self._model, sound)
 
     def _rows(self, sounds: Sequence[Samples]) -> Samples:
         """Each sound as it is heard, at its lags, (chosen, sounds * TAPS)."""
-        return np.concatenate([at_lags(self._heard(x), TAPS, TAPS // 2)[self._chosen] for x in sounds], axis=1)
+        heard = (self._measurement.heard(self._model, sound) for sound in sounds)
+        return np.concatenate([at_lags(x, TAPS, TAPS // 2)[self._chosen] for x in heard], axis=1)
 
     def _weights(self, rows: Samples, target: Samples) -> Samples:
         """Least-squares weights of rows (chosen, k) for a target (chosen,), or several (chosen, m)."""
@@ -199,7 +198,7 @@ def excerpt(measurement: Measurement, model: VoiceModel, size: int) -> slice:
     return slice(0, size) if model.timed else loudest(measurement.reference, fitted, size)
 
 
-def loudest(x: Samples, fitted: NDArray[np.bool_], size: int) -> slice:
+def loudest(x: Array, fitted: NDArray[np.bool_], size: int) -> slice:
     """The loudest `size` samples of x (n,) among the stretches with at least half as many samples to fit to as the best one."""
     if x.size <= size:
         return slice(0, x.size)

@@ -55,8 +55,6 @@ class MicAgc(Effect):
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
         knots = numbers(values, "gain_db")
-        if not knots.any():
-            return x.copy()
         position = np.arange(x.size) * (float(values["knots_hz"]) / sample_rate)
         return (x * amplitude(np.interp(position, np.arange(knots.size), knots))).astype(np.float32)
 

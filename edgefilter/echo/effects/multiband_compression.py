@@ -145,8 +145,7 @@ def find_crossovers(found: Spectra) -> tuple[float, float, float] | None:
 
     None where the bands explain as much without these phases: then nothing was cut into bands.
     """
-    turned = found.cross[:, None] * np.exp(2j * np.pi * np.outer(found.hz, DELAYS) / SAMPLE_RATE)
-    turned = np.concatenate((turned.real, turned.imag))
+    turned = found.earlier(DELAYS)
 
     def explained(bands: NDArray[np.complex128]) -> Array:
         """Energy that these bands (pairs, BANDS, m) explain at each delay, (pairs, delays); -inf if a band would need a negative gain."""
