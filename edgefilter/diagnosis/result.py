@@ -27,7 +27,6 @@ Fate: TypeAlias = Literal[
 """What became of an effect that was tried; only where a proof in the running filter was asked for can it have failed one."""
 Source: TypeAlias = Literal["jacobian", "thirds", "at its bound", "none"]
 """Of a standard error: the prediction's derivatives, fits to a third of the recording each, or why there is none."""
-SCHEMA = 2
 
 
 @dataclass(frozen=True)
@@ -177,7 +176,7 @@ class Diagnosis:
             for finding in self.ranking
         ]
         return {
-            "schema": SCHEMA,
+            "schema": 2,
             "verdict": self.verdict,
             **{key: compared[key] for key in ("excess_db", "noise_floor_db")},
             "ranking": ranking,

@@ -39,7 +39,7 @@ class SourceChain:
         self.expected: list[Samples] = []
         for effect, values in chain(effects):
             if effect.adds_noise and not effect.followed:
-                self._makers.append(partial(ExpectedSquare, effect, values, effect.memory or 0))
+                self._makers.append(partial(ExpectedSquare, effect.variance, values, effect.memory or 0))
                 self.colours.append(effect.colour(values))
             if effect.stage == "source" and (make := stream_form(effect, values)):
                 self._makers.append(make)
@@ -84,31 +84,21 @@ class VoiceChain:
 
 
 class Windowed:
-    """An effect on a stream by apply, at each hop on the hop and so many samples before it."""
+    """A hook of an effect, its apply or variance, on a stream: at each hop on the hop and so many samples before it."""
 
-    def __init__(self, effect: Effect, values: Values, memory: int) -> None:
-        self._effect, self._values, self._memory = effect, values, memory
+    def __init__(self, hook: Callable[[Samples, Values, int], Samples], values: Values, memory: int) -> None:
+        self._hook, self._values = hook, values
         self._past = np.zeros(memory, np.float32)
 
-    def window(self, x: Samples) -> Samples:
-        """The next samples x (n,) behind the past, (memory + n,)."""
-        if not self._memory:
-            return x
-        whole = np.concatenate((self._past, x))
-        self._past = whole[x.size :]
-        return whole
-
     def __call__(self, x: Samples, heard: Samples | None = None) -> Samples:
-        """Return x (n,) after the effect."""
-        return self._effect.apply(self.window(x), self._values, SAMPLE_RATE)[self._memory :]
+        """Return what the hook makes of x (n,), (n,)."""
+        whole, memory = np.concatenate((self._past, x)), self._past.size
+        self._past = whole[x.size :]
+        return self._hook(whole, self._values, SAMPLE_RATE)[memory:]
 
 
 class ExpectedSquare(Windowed):
-    """What an effect that no waveform predicts adds to the expected square of each sample, on a stream."""
-
-    def __call__(self, x: Samples, heard: Samples | None = None) -> Samples:
-        """Return what x (n,) sets off, (n,)."""
-        return self._effect.variance(self.window(x), self._values, SAMPLE_RATE)[self._memory :]
+    """What an effect that no waveform predicts adds to the expected square of each sample, on a stream: by its variance."""
 
 
 def stream_form(effect: Effect, values: Values) -> Callable[[], Runner] | None:
@@ -118,7 +108,7 @@ def stream_form(effect: Effect, values: Values) -> Callable[[], Runner] | None:
     if effect.run(values, SAMPLE_RATE) is not None:
         return lambda: cast(Runner, effect.run(values, SAMPLE_RATE))
     memory = _memory(effect, values)
-    return None if memory is None else partial(Windowed, effect, values, memory)
+    return None if memory is None else partial(Windowed, effect.apply, values, memory)
 
 
 def reach(effect: Effect, values: Values) -> str:

@@ -33,8 +33,8 @@ DECAYS_MS, EXPONENTS = (4.0, 8.0, 16.0, 32.0), (0.5, 0.7, 1.0)
 CLEAR, STANDS_OUT = 30.0, 1.25
 """Times the fan that the voice must be in a band for its noise to be expected there, and that the residual must be in the median
 one of these bands: what happens in a narrow band alone is no codec's."""
-SHORT, LONG = (512, 128), (1024, 256)
-"""Frame and hop, for what is coherent with the voice and for harmonics."""
+SHORT, LONG = 512, 1024
+"""Samples of a frame, for what is coherent with the voice and for harmonics; four begin in one."""
 PLACES = ((7, 15), (13, 7), (3, 41))
 """Frames of 8 ms and bins of 31 Hz around a cell within which a change of the voice is one complex gain: a path that moves, a
 gain that changes, a clock that trembles."""
@@ -139,26 +139,25 @@ def _is_codec(measurement: Measurement, voice: Samples) -> bool:
     left = measurement.white_recording - voice
     fine = filtered(voice, short_filter(voice, left, measurement.weights), LEAD)
     voice, left = voice + fine, left - fine
-    heard = (measurement.weights > 0.0) & (uniform_filter1d(voice * voice, LONG[0]) > HEARD)
-    cells = _spectra(voice, *SHORT), _spectra(left, *SHORT), _whole(heard, *SHORT)
+    heard = (measurement.weights > 0.0) & (uniform_filter1d(voice * voice, LONG) > HEARD)
+    cells = _spectra(voice, SHORT), _spectra(left, SHORT), _whole(heard, SHORT)
     return _follows(*cells) > FOLLOWS and _peaked(left, heard) < PEAKED and not _coherent(*cells)
 
 
-def _spectra(x: Samples, size: int, hop: int) -> NDArray[np.complex64]:
+def _spectra(x: Samples, size: int) -> NDArray[np.complex64]:
     window = hann(size).astype(np.float32)
-    return scipy.fft.rfft(frames(x, size, hop) * (window / np.sqrt(np.sum(window**2))), axis=1)[
-        :, size // 128 : -size // 128
-    ]
+    window /= np.sqrt(np.sum(window**2))
+    return scipy.fft.rfft(frames(x, size, size // 4) * window, axis=1)[:, size // 128 : -size // 128]
 
 
-def _whole(heard: NDArray[np.bool_], size: int, hop: int) -> NDArray[np.bool_]:
+def _whole(heard: NDArray[np.bool_], size: int) -> NDArray[np.bool_]:
     """Whether the voice is heard in nearly all of each, (frames,)."""
-    return frames(heard.astype(np.float32), size, hop).mean(axis=1) > 0.9
+    return frames(heard.astype(np.float32), size, size // 4).mean(axis=1) > 0.9
 
 
 def _follows(said: NDArray[np.complex64], rest: NDArray[np.complex64], whole: NDArray[np.bool_]) -> float:
     """Correlation of the levels of both (frames, bins) in dB, within bands over time, where both are over the fan."""
-    edges = np.unique(np.geomspace(1, SHORT[0] // 2 - 12, 16).astype(int))
+    edges = np.unique(np.geomspace(1, SHORT // 2 - 12, 16).astype(int))
     over, loud = (
         np.add.reduceat(uniform_filter(power_of(spectra), (5, 1)), edges[:-1], axis=1)[:, :-1] / np.diff(edges)[:-1]
         for spectra in (rest, said)
@@ -193,8 +192,8 @@ def _explained(
 
 def _peaked(left: Samples, heard: NDArray[np.bool_]) -> float:
     """Standard deviation of the log of the residual's (n,) fine structure over frequency, where the voice is heard."""
-    power = power_of(_spectra(left, *LONG))[:, : LONG[0] * 3 // 16]
+    power = power_of(_spectra(left, LONG))[:, : LONG * 3 // 16]
     log = np.log(power + 1e-6)
-    use = _whole(heard, *LONG)[:, None] & (uniform_filter1d(power, AROUND, axis=1) > 2.0 * HEARD)
+    use = _whole(heard, LONG)[:, None] & (uniform_filter1d(power, AROUND, axis=1) > 2.0 * HEARD)
     fine = (log - uniform_filter1d(log, AROUND, axis=1)) * use
     return float(np.sqrt(np.sum(fine * fine) / max(np.count_nonzero(use), 1)))

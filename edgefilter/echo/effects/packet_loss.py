@@ -20,8 +20,8 @@ STEP = 40
 """Samples (2.5 ms) of the finest grid on which frames are looked for."""
 LENGTHS = (4, 8, 12, 16, 24)
 """Steps of a frame: 10, 20, 30, 40, 60 ms, those of RTP's audio formats (RFC 3551, 6716)."""
-TAPS, SPREAD = 640, 600
-"""Samples of the path from the direct sound on by which a missing frame is recognised, and of the whitening filter on each side."""
+TAPS = 640
+"""Samples of the path from the direct sound on by which a missing frame is recognised."""
 BLOCK = STEP * min(LENGTHS)
 """Samples of the shortest frame."""
 LOUD, MISSING, PREDICTED = 30.0, 0.5, 0.1
@@ -146,7 +146,8 @@ def _steps(measurement: Measurement, model: VoiceModel) -> Steps | None:
     share = rest[loud] / voice[loud]
     if np.count_nonzero(share > MISSING) < FEWEST or np.median(share) > PREDICTED:
         return None
-    path = whiten(np.pad(model.impulse_response, (PRE_ROLL, SPREAD)), psd)[: TAPS + PRE_ROLL]
+    rings = psd.size - 1  # the whitening, on either side
+    path = whiten(np.pad(model.impulse_response, (PRE_ROLL, rings)), psd)[: TAPS + PRE_ROLL]
     count, size = heard.size // STEP, STEP + path.size - 1
     pieces = measurement.reference[: count * STEP].reshape(count, STEP)
     driven = scipy.signal.fftconvolve(pieces, path[None], axes=1).astype(np.float32)
