@@ -73,7 +73,9 @@ def test_what_cannot_be_is_one_line_and_the_output_is_left_alone(folder: Path) -
     both = ("--mic-channels", "1,2", "--reference-channel", "4", "--reference", folder / "five.wav")
     one_line(run(folder, *both), 2, "--reference-channel is the reference, found --reference too")
     one_line(
-        run(folder, "--engine", "ss", "--turns", folder / "turns"), 2, "--turns needs an engine that detects speech, and ss does not"
+        run(folder, "--engine", "ss", "--turns", folder / "turns"),
+        2,
+        "--turns needs an engine that detects speech, and ss does not",
     )
     assert (folder / "out.wav").read_bytes() == b"kept"
 
