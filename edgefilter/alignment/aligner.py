@@ -22,7 +22,7 @@ from edgefilter.types import PRE_ROLL, SAMPLE_RATE, AlignmentCounts, AlignmentSt
 UNLOCATED: tuple[AlignmentState, ...] = ("begun", "announced")
 """States of the alignment in which the reference may lie elsewhere than the microphone hears it."""
 LIKELY_LAG_S = 2.0
-"""Lag of the playback up to which an utterance is waited for: one that is heard later is rarer than a loudspeaker that is muted."""
+"""Longest lag, seconds, for which an utterance is waited for: where it is not heard by then, it is likelier that the loudspeaker is muted."""
 LATE = SAMPLE_RATE // 10
 """Samples by which a reference may come after its echo and is still found for an utterance; with LATEST they are found .15 s later."""
 LATEST, FURTHEST = 2 * SAMPLE_RATE, 5 * SAMPLE_RATE
@@ -46,7 +46,7 @@ that no measurement has ever seen is doubted once it is more likely wrong than r
 
 
 class Past(NamedTuple):
-    """The last seconds of both channels, and the utterances in the reference."""
+    """The last seconds of microphone and reference, and the utterances in the reference."""
 
     mic: DelayBuffer
     ref: DelayBuffer

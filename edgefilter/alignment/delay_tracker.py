@@ -41,8 +41,8 @@ FAINT, STRANGE, EDGE = 0.25, 10.0, 64
 """Lower and upper limit of the microphone's power over the expected echo's, outside of which no jump can be measured, and samples
 at each end of the range in which none is believed."""
 DRIFTED = 1.5
-"""Samples. Two measurements that differ by less show the same jump; a jump of less is attributed to the clocks' drift, since a lost or
-repeated buffer makes a larger one."""
+"""Samples. Two measured delays that differ by less show the same jump; a smaller change is the clocks' drift, since a lost or repeated
+buffer makes a larger one."""
 EXPECTED, UNEXPECTED = 3.0, 5.0
 """Gates, in standard deviations, for the measured delay less the predicted one. A difference of less than SMALL samples counts as drift up
 to EXPECTED, one of less than DRIFTED samples up to UNEXPECTED; any other contradicts the estimate. With 3 for both gates 2 of 16
@@ -113,9 +113,9 @@ class DelayMeter:
     def measure(
         self, mic: DelayBuffer, ref: DelayBuffer, now: int, delay: float, slope: float, far: bool
     ) -> DelayMeasurement | None:
-        """Compare the last FRAME samples of mic with the reference at the expected delay; None where either is silent.
+        """Measure the delay of the last FRAME samples of mic, near the expected one; None where microphone or reference is silent.
 
-        far: look at 2 REACH further lags on each side as well.
+        far: also up to 2 REACH lags further away, earlier and later.
         """
         centre = delay - slope * (FRAME / 2)
         whole = round(centre)

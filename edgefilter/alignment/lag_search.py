@@ -49,11 +49,10 @@ MISSED = 0.3
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """The most likely lag in samples, and by how much: its evidence over that of the most likely lag elsewhere.
+    """The likeliest lag in samples, and its clearness: its evidence over that of the likeliest lag away from it.
 
-    Two voices of like pitch agree at many lags, a period apart, the robot with itself at one: what they have in common raises
-    the evidence of several lags, only the robot's arrival that of one alone. at: sample counter of the microphone at the end
-    of the look. heard: samples of the utterance that were heard if the lag is true.
+    Another voice of similar pitch matches the reference at many lags, a period apart; the robot's own voice at one alone. at: sample
+    counter of the microphone at the end of the search. heard: samples of the utterance that were heard if the lag is right.
     """
 
     lag: int

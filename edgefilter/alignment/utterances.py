@@ -65,7 +65,7 @@ class Utterance:
 
 
 class Sustained:
-    """How loud a voice is that may hold clicks: the level that it holds for a short vowel."""
+    """Loudness of a voice in which clicks do not count: the level that it keeps up for a short vowel."""
 
     def __init__(self) -> None:
         self._powers = deque([0.0] * SUSTAINED, maxlen=SUSTAINED)
@@ -207,7 +207,7 @@ class FirstSounds:
         """Take a hop mic (hop,); whether its sound is the robot at another delay.
 
         explained: (hop,), the reference at the present delay, zeros while none is known. loudest: mean square of the
-        reference's loudest hop. waits: whether there is an utterance whose delay was not found yet.
+        reference's loudest hop so far. waits: whether the delay of an utterance is still to be found.
         """
         power, brought = float(np.dot(mic, mic)), float(np.dot(explained, explained))
         if state == "locked" and brought > 0.1 * self._hop * loudest:
@@ -219,7 +219,7 @@ class FirstSounds:
         if not waits:
             self._since, self._before = 0, RECENT if loud else max(self._before - self._hop, 0)
             return False
-        # a sound that was as loud before the utterance began is somebody else's
+        # a sound that was as loud before the robot's utterance began is not the robot's
         if self._since or (loud and not self._before):
             self._since += self._hop
         return 0 < self._since <= (LONGEST if self._heard else np.inf)

@@ -17,8 +17,8 @@ FEW = 4
 def convolve(x: Array, taps: Array) -> Array:
     """The full convolution of x (n,) and taps (t,), (n + t - 1,), float32 where both are.
 
-    Overlap-save (Oppenheim & Schafer, Discrete-Time Signal Processing, 8.7.3): of each block of some four filter
-    lengths the first t - 1 samples are wrapped and left out. Takes half of the time of scipy.signal.oaconvolve.
+    Overlap-save (Oppenheim & Schafer, Discrete-Time Signal Processing, 8.7.3): in blocks of about four
+    filter lengths, of each of which the first t - 1 samples, which wrap around, are left out. Takes half the time of scipy.signal.oaconvolve.
     """
     before, whole = taps.size - 1, x.size + taps.size - 1
     size = 1 << max(4 * taps.size, 1024).bit_length()

@@ -11,7 +11,7 @@ from edgefilter.dsp.frames import frames
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 GRID_FFT = 1200
-"""FFT length of the frequency grid of profiles and of most densities, the paper's 601 bins."""
+"""FFT length of the frequency grid of profiles and of most power spectral densities: 601 bins, as Li et al. (2024) have."""
 GRID_BINS = GRID_FFT // 2 + 1
 ROUNDING_PSD = 1e-14
 """PSD of rounding to 16 bit: (2^-15)^2 / 12 / 8 kHz, rounded down."""

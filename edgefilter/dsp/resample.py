@@ -12,7 +12,7 @@ from edgefilter.errors import UsageError
 from edgefilter.types import SAMPLE_RATE, Samples
 
 HALF_S = 0.0035
-"""Reach of the kernel into the future, seconds: a band of 630 Hz between what passes and what is stopped."""
+"""Seconds of future samples that the filter kernel needs; with as many its transition band is 630 Hz wide."""
 SPARED_HZ = 8000
 """Lowest rate with this reach; below, it grows in proportion, so that no larger part of the band is lost."""
 BETA = 6.76

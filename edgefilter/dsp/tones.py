@@ -1,4 +1,4 @@
-"""Tones in a noise, and the mains that they may come from."""
+"""Steady tones in a noise, and the frequency of the mains (50 or 60 Hz) whose harmonics they may be."""
 
 from __future__ import annotations
 

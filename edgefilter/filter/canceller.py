@@ -36,7 +36,7 @@ hop says, before the echo has arrived or while the voice only begins, may be wro
 DECAY_RT60_S = 1.0
 """Decay of the covariance prior behind the direct sound, seconds for 60 dB."""
 LATE_VARIANCE = 0.04
-"""Prior variance of an unknown room's decay, extrapolated to the direct sound, relative to the power of the calibrated path."""
+"""Prior variance of the taps of an unknown room's reverberation, extrapolated back to the direct sound, over the calibrated path's power."""
 DISPLACEMENT_SCALE = 0.7
 """Displacement, relative to the loudest rms that the reference has held so far, at which the products have its size."""
 FURTHEST = 10.0
@@ -274,7 +274,7 @@ class Canceller:
         return echo
 
     def tell_by(self, microphone: int) -> None:
-        """Track the gain in this microphone from now on, and begin the path anew, which the other's gain has scaled."""
+        """Track the volume in this microphone from now on, and begin the path anew: it was scaled by the gain of the one before."""
         if microphone != self._teller:
             self._teller = microphone
             self._begin()

@@ -108,7 +108,7 @@ class FilteredHop(NamedTuple):
 
 
 class PathUpdate(NamedTuple):
-    """A path that predicts better, to be taken over: "learned", or "unlearned" where an earlier one comes back; detail: in words."""
+    """An echo path to use from now on, since it predicts the echo better. kind: "learned", or "unlearned" where an earlier one comes back."""
 
     path: PathState
     kind: EventKind

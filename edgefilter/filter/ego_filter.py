@@ -205,7 +205,7 @@ class EgoFilter:
 
     @property
     def judges_speech(self) -> bool:
-        """Whether the engine, and each cheaper one that may take over, judges speech."""
+        """Whether the engine, and each cheaper one that may take over, tells whether a human speaks."""
         return all(judges_speech(engine) for engine in self._engines)
 
     def process(self, mic_block: Samples, ref_block: Samples) -> Samples:

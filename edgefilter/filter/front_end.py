@@ -111,11 +111,11 @@ class LinearStage:
 class FrontEnd:
     """Finds the reference in the microphone and subtracts its linear echo.
 
-    The engine's `front` says what it does (engines/base.py). aligner: None for "none". linear_stage: None but for "full".
-    cut: (bins,) gain of every spectrum, None for 1. microphones: of an array, and None for a single one; the kinds without a
-    linear stage hear its first. spatial: None but for "full" with an array. errors: (microphones, bins) of the latest frame
-    of an array. linear: what the linear stage made of the latest hop. heard: the microphone's latest hop, (hop,), without
-    its offset and hum.
+    The engine's `front` is its kind: "full", "none" and others (engines/base.py). aligner: None if "none". linear_stage: None unless
+    "full". cut: (bins,) gain of every spectrum, None for 1. microphones: their number in an array, None for a single one; kinds
+    without a linear stage use the first alone. spatial: None unless "full" with an array. errors: (microphones, bins), what is left
+    of an array's latest frame. linear: the linear stage's output of the latest hop. heard: the microphone's latest hop, (hop,),
+    without its offset and hum.
     """
 
     def __init__(
@@ -195,7 +195,7 @@ class FrontEnd:
         return Frame(x, r, e, error, noise, residual, aligned.state == "idle", at_any_lag), aligned
 
     def _waiting(self, mic: Samples, wait: int) -> Samples:
-        """The hop of mic (..., hop) that ends `wait` samples before the latest one, WAIT at most."""
+        """The hop of mic (..., hop) that ends `wait` samples, at most WAIT, before the latest sample."""
         before = np.zeros((*mic.shape[:-1], WAIT), np.float32) if self._tail is None else self._tail
         heard = np.concatenate((before, mic), axis=-1)
         self._tail = heard[..., -WAIT:]

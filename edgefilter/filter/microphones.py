@@ -10,7 +10,7 @@ from edgefilter.filter.echo_path import TAPS
 from edgefilter.types import SAMPLE_RATE, Array, ArrayStats, Samples
 
 GOOD_BLOCKS = 3
-"""Blocks of a second without a reason, in a row, after which one that was left out comes back: a loose contact does not."""
+"""Blocks of a second without a fault, in a row, after which a microphone that was left out is used again: one with a loose contact has fewer."""
 APART_DB = 12.0
 """From the median microphone's level: equal microphones of one array agree within 1 to 2 dB, one of another kind beside them
 was 12 to 18 dB louder (a real robot's noise on four microphones)."""

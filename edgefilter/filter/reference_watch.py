@@ -94,7 +94,7 @@ class ReferenceWatch:
     def step(
         self, mic: Samples, ref: Samples, aligned: Aligned, frame: Frame, removal: Removal, speaking: bool
     ) -> list[tuple[EventKind, str]]:
-        """Take a hop (hop,) of both channels and what was made of it; what is to be said. speaking: whether a human is."""
+        """Take a hop (hop,) of microphone and reference, and what the filter made of it; the events to report. speaking: whether a human is."""
         begun = aligned.past.onsets.current
         if begun.end - begun.start == 2 * self._hop:
             self._loudest = 0.0
@@ -136,7 +136,7 @@ class ReferenceWatch:
             return None if self._missing else ""
         return (
             f"{self._missing}; little of the robot is removed, and nobody is noticed while it talks; use a loopback that loses"
-            " nothing, or larger buffers"
+            " no samples, or larger buffers"
         )
 
     def _compare_speed(self, aligned: Aligned) -> str | None:
@@ -264,7 +264,7 @@ class ReferenceWatch:
         )
 
     def _wait_for_any(self, power: float, played: float) -> str:
-        """Count what is heard while no reference ever came."""
+        """Count what the microphone hears while no reference has come yet; return the message, "" for none."""
         self._ever = self._ever or played > LAST_BIT
         if self._ever:
             return ""

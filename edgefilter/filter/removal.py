@@ -21,8 +21,8 @@ LITTLE_DB = 3.0
 """Echo reduction, dB, below which the robot's echo counts as unpredicted. Tuned on 27 real recordings: with an intact loopback the
 reduction stays at 4 dB or more, but for the processed microphone gf_0sKU1J (2.6 dB at first, later 0.8)."""
 MUCH_DB = 6.0
-"""ERLE, dB, that once reached shows that the echo is linear in the reference: if it is less later, that has another cause.
-Of the 27 recordings gf_655836 is one that would be told otherwise."""
+"""ERLE, dB. Where it was reached once, the echo is linear in the reference, and a lower ERLE later has another cause. Without this rule
+one of 27 recordings, gf_655836, would get a wrong message."""
 FOLLOWS = 0.4
 """Correlation of the log powers of error and reference from which on what is left is the robot: 0.5 to 0.6 on that
 microphone; where a human talks all the time -0.1 to 0.3."""

@@ -39,9 +39,9 @@ filter that starts three seconds before a soft human notices them .15 s later.""
 
 
 class NoiseTracker:
-    """Power of the stationary noise in each bin, whatever speaks beside it.
+    """Power of the stationary noise in each bin, also while somebody speaks.
 
-    Every frame counts with the probability that it holds nothing else: Gerkmann & Hendriks (2012), "Unbiased MMSE-based
+    Every frame is weighted by the probability that it holds only noise: Gerkmann & Hendriks (2012), "Unbiased MMSE-based
     noise power estimation with low complexity and low tracking delay", eq. (18), (22) and (23), with their values.
     """
 

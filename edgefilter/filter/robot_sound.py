@@ -17,9 +17,9 @@ MEMORY_S = 20.0
 NOISY = 4.0
 """Power over the noise's, 6 dB, from which on a band is compared."""
 ALIKE_DB = 3.7
-"""Standard deviation over the bands of the difference in level, below which a sound is taken for the robot, however loud it is. On
-25 real devices 2 of 3 stretches of 4 s of robot differ by less from the others. Of 664 stretches of humans 5.7 % are below 5.4 dB
-and one is below 4.4 dB, so that one in some 8000 is expected below this."""
+"""dB. A sound whose levels in bands differ from the robot's by a smaller standard deviation is taken for the robot, however loud it is. On
+25 real devices two thirds of the stretches of 4 s of robot differ by less from the device's other stretches. Of 664 stretches of
+humans 5.7 % are below 5.4 dB and one below 4.4 dB: extrapolated, one in 8000 is below this."""
 
 
 class RobotSound:

@@ -156,9 +156,9 @@ class SpatialFilter:
 
 
 def diffuse_coherence(stft: StftConfig, microphones: int) -> Samples:
-    """Covariance of equal microphones SPACING_M apart in a field from all directions, (microphones, microphones, bins) float32.
+    """Covariance of equal microphones, every two SPACING_M apart, in a diffuse field, (microphones, microphones, bins) float32.
 
-    Where it would be negative it is zero: more than five microphones cannot all differ from one another so.
+    Negative values are set to 0: more than five microphones cannot all be so negatively correlated with one another.
     """
     between = np.sinc(2.0 * stft.frequencies * SPACING_M / 343.0)  # m/s, the speed of sound
     ones = np.eye(microphones)[:, :, None]

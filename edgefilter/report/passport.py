@@ -75,7 +75,7 @@ def advice(found: Passport) -> list[str]:
         told.append(f"turn the microphone's gain up: its peaks reach only {found.mic_peak_db:.0f} dBFS")
     if found.lost_ms:
         told.append(
-            f"use a loopback that loses nothing, or larger buffers: {found.lost_ms:.0f} ms are missing in the reference"
+            f"use a loopback that loses no samples, or larger buffers: {found.lost_ms:.0f} ms are missing in the reference"
         )
     elif found.lag_spread_ms > SET_UP.lag_spread_ms:
         told.append(
