@@ -63,7 +63,7 @@ def _fate(entry: Tried, found: Found, named: Collection[str]) -> tuple[Fate, str
 
 
 def asks(tried: Sequence[Candidate]) -> tuple[str, ...]:
-    """A line where several explanations remain: the robot can ask which it is."""
+    """One line where several explanations remain: `edgefilter probe` can find out which of them is true; none otherwise."""
     left = [" with ".join(effects) for effects in remaining(tried)]
     told = f"{', '.join(left[:-1])} or {left[-1]}: edgefilter probe plays what tells them apart" if left[1:] else ""
     return (told,) if told else ()

@@ -55,7 +55,7 @@ class Criteria:
 
     # The verdict
     explained_db: float = 0.8
-    """Excess up to which nothing is missing: what the fan of another day and a faint distortion leave."""
+    """Residual over what the profile expects, dB, up to which nothing is missing: the fan of another day and a faint distortion leave as much."""
     much_db: float = 3.0
     """Over the silences: what the model of an effect that is really there does not leave."""
     nearly_all: float = 0.99

@@ -76,7 +76,7 @@ class Band:
 
 @dataclass(frozen=True)
 class Expected:
-    """What an engine does: robot lowered, false starts of speech, SI-SDR of a human laid on, without and with it."""
+    """What an engine does: dB by which it lowers the robot, false starts of speech, SI-SDR in dB of a human laid on, before and after it."""
 
     removed_db: float
     false_starts: int | None

@@ -33,7 +33,7 @@ TALK_DB = 8.0
 GAP_S, EDGE_S = 1.0, 0.2
 """Pauses of a talker, between two sentences, that count as talk, and what is left out before and after talk. By hand."""
 ORDINARY = 2.0
-"""Times the calibrated distortion: that of speech was up to 3.4 dB off what multisines of its spectrum had shown."""
+"""Distortion of up to so many times the calibrated power is ordinary: with speech it was up to 3.4 dB off what multisines had shown."""
 CUT, CUT_DB = 32, -30.0
 """A reference begins or ends in the middle of a word where so many samples (2 ms) at its end are no further below its
 loudest 20 ms: pauses are softer."""

@@ -27,7 +27,7 @@ FIRST = 0.6
 """Part of the robot's voice that the proof fits to: the rest is as short as suffices to test a filter, since a fit to less
 than all is worse than the one that is written."""
 NEAR = 0.1
-"""Of the recording, how far either way the cut may move to fall into a pause."""
+"""Share of the recording by which the cut between what is fitted and what is tested may move, either way, into a pause."""
 LEAST_S = BLOCK / SAMPLE_RATE
 """Seconds of the robot alone that each part must hold: of less nothing is fitted and tested in turn."""
 WORSE_DB = 0.2
@@ -61,7 +61,7 @@ class Proof:
 
     @property
     def culprit(self) -> str | None:
-        """The effect without which the others do least harm; None where there is but one, or no harm."""
+        """The effect whose removal makes the running filter best; None where there is but one, or nothing became worse."""
         return max(self.without, key=lambda entry: entry[1])[0] if self.without else None
 
     def to_dict(self) -> dict[str, object]:

@@ -108,8 +108,8 @@ class Workbench:
     ) -> None:
         self.recording, self.criteria = recording, criteria
         self._start = start or recording.model
-        # a profile made from the recording itself (self_calibrate) has effects at neutral values: its path or fan already
-        # holds them, so that they are not tried
+        # a profile made from the recording itself (self_calibrate) has some effects at neutral values: what they would explain
+        # is in its path or fan already, so they are not tried
         taken_up = (name for name, values in self._start.effects if vanishes(find(name), values))
         self._without = {*without, *taken_up}
         self._progress = progress
@@ -242,7 +242,7 @@ class Workbench:
         return ahead.model if ahead else None
 
     def known_by(self, law: Trial) -> Reading | None:
-        """The listed filter on the path that explains most of what a law's filter does by itself."""
+        """The named effect, a filter of the path, that explains most of what the filter fitted in `law` explains; None where neither does."""
         start = self._start
         listed = [name for name in names() if (one := find(name)).stage == "path" and one.absorbed and not one.free]
         best = max(
@@ -288,13 +288,13 @@ class Workbench:
         return (*found, *(Tried(name, None, None, spared=True) for name in spared))
 
     def preferred(self, trials: Iterable[Trial]) -> Trial | None:
-        """Of admissible trials the simplest of those that no other outdoes; None where none lowers the level."""
+        """The simplest of the admissible trials that no other outdoes; None where none lowers the residual's level."""
         trials = [trial for trial in trials if trial.gain_db > 0.0]
         enough = [one for one in trials if not any(self._outdoes(other, one) for other in trials)]
         return min(enough, key=lambda trial: (find(trial.name).complexity, -trial.gain_db), default=None)
 
     def _outdoes(self, one: Trial, other: Trial) -> bool:
-        """Whether one explains more than another, not by chance alone; if flexible, by more than such an effect fits of any residual."""
+        """Whether `one` explains more than `other`, beyond chance; if `one` is flexible, by more than what it takes up of any residual."""
         by_chance = own_p_value(one.name, one.gain_db - other.gain_db) > self.criteria.false_rate
         taken_up = find(one.name).flexible and other.gain_db >= self.criteria.nearly * one.gain_db
         return not (by_chance or taken_up)
@@ -305,7 +305,7 @@ class Workbench:
         return [name for name in names() if name not in out and not find(name).free]
 
     def less(self, model: EchoModel, name: str) -> EchoModel:
-        """The model without what it has of that effect beyond the start."""
+        """The model without that effect, or with it as the model had it from which the search began."""
         return less(self._start, model, name)
 
 

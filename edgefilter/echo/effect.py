@@ -91,7 +91,7 @@ class Effect:
     free: ClassVar[bool] = False
 
     def apply(self, x: Samples, values: Values, sample_rate: int) -> Samples:
-        """The signal (n,) after the effect; x is not written to. By default what run() makes of all of it, or x itself."""
+        """The signal (n,) after the effect; x is not written to. By default what run() makes of all of x, or a copy of x without run()."""
         stream = self.run(values, sample_rate)
         return x.copy() if stream is None else stream(x)
 

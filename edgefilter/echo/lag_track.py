@@ -83,7 +83,9 @@ def _fine(near: Samples, block: Samples) -> tuple[Array, Array]:
     window = np.hanning(block.shape[1]).astype(np.float32)
     a, b = scipy.fft.rfft(near * window), scipy.fft.rfft(block * window)
     cross = b * np.conj(a)
-    w = (2 * np.pi / block.shape[1] * np.arange(a.shape[1])).astype(np.float32)  # single precision, as the spectra
+    w = (2 * np.pi / block.shape[1] * np.arange(a.shape[1])).astype(
+        np.float32
+    )  # w in single precision, as the spectra are
     lag = np.array([climb(row, w, 0.0, steps=6) for row in cross])
     turned = cross * np.exp(1j * w * lag[:, None])
     power = np.abs(a) ** 2

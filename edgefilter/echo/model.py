@@ -134,7 +134,7 @@ class EchoModel:
         return through(scaling, np.ones(size, np.float32))
 
     def fan(self, noise: Samples) -> Samples:
-        """The fan's sound (n,) in this recording, from one (n,) like that at its end; noise itself where it never changes."""
+        """The fan's sound (n,) throughout the recording, made of noise (n,), the fan as at its end; noise itself where the fan never changes."""
         for effect, values in chain(self.effects):
             if effect.stage == "noise":
                 noise = effect.passed(noise, noise, values, SAMPLE_RATE)

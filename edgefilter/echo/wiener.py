@@ -128,7 +128,7 @@ def _circulant(x: Samples, taps: int, size: int) -> Array:
 class Spectra:
     """Of the whitened fit samples: frequencies (m,) Hz, auto-spectra of prediction and recording and cross-spectrum, (m,).
 
-    fan: what the fan alone has in each on average. averaged: bins of the transform in each.
+    fan: mean power of the fan alone at each frequency. averaged: bins of the transform that were averaged into each frequency.
     """
 
     hz: Array

@@ -19,7 +19,7 @@ FADE = 512
 LEAST_JUMP = 0.3
 """Samples; less is no jump, but a block's lag that is not known better."""
 OUTLIER = 25.0
-"""A block adds at most this to the squared, normalised distance from the steps or the line: five standard deviations."""
+"""Most that the lag of one block adds to the squared misfit, in its variances, of a course of steps or of a line: five standard deviations."""
 COST = 12.0
 """What each number of a step function has to save in squared, normalised distance, per unit of log(blocks)."""
 HISTORY, SETTLED, AFTERMATH = 8000, 640, 6400

@@ -22,7 +22,7 @@ FFT = 4096
 TAPS, LEAD, EXPECTED = 48, 16, 1e-4
 """Of the filter that takes up what a smooth gain of least phase is not: 3 ms, and a hundredth for each tap."""
 BEND = 3e-3
-"""How strongly the gain is kept smooth, re the energy of a knot."""
+"""Weight of the gain curve's curvature, relative to the largest energy of the signal around one knot of the curve."""
 MOST_DB = 40.0
 
 

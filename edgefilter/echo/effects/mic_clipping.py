@@ -18,7 +18,7 @@ STEPS = 1.0 - np.array([0.0, 0.01, 0.02, 0.04, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0
 class MicClipping(Effect):
     """y = x / (1 + |x / level|^p)^(1/p): an amplifier that saturates at +-level (Rapp 1991, eq. 1), p its hardness.
 
-    p = 2 is a soft limiter; from 100 on it is a hard clip. Level 100, far beyond any converter, stands for no limit.
+    p = 2 is a soft limiter; from 100 on it is a hard clip. Level 100 (full scale is 1) stands for no limit.
     """
 
     name = "mic_clipping"

@@ -148,7 +148,7 @@ def find_crossovers(found: Spectra) -> tuple[float, float, float] | None:
     turned = found.earlier(DELAYS)
 
     def explained(bands: NDArray[np.complex128]) -> Array:
-        """Energy that these bands (pairs, BANDS, m) explain at each delay, (pairs, delays); -inf if a band would need a negative gain."""
+        """Energy that the bands of each pair of crossovers (pairs, BANDS, m) explain, (pairs, delays); -inf where a gain is negative."""
         both = np.concatenate((bands.real, bands.imag), axis=2)
         matrix = both * np.tile(found.predicted, 2) @ both.swapaxes(1, 2)
         right = both @ turned

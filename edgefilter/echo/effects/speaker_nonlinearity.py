@@ -17,9 +17,9 @@ from edgefilter.echo.recording import BLOCK
 from edgefilter.types import SAMPLE_RATE, Array, Samples
 
 BOUND = 4.0
-"""Of each weight: at the end of its excursion a law is off by no more than this, whatever is played."""
+"""Largest weight: what a law adds to the sound is at most so many times that sound, whatever is played."""
 DRIVER, AMPLIFIER = ("force_factor", "stiffness", "damping"), ("even", "odd")
-"""The laws, with two weights each."""
+"""Names of the laws of the membrane's driver and of the amplifier; each law has two weights."""
 RESONANCES_HZ, REACH_HZ = (250.0, 180.0, 215.0, 300.0, 370.0), (160.0, 1000.0)
 """Of small drivers, the usual one first; how low is tried, where MOTION_TAPS are just enough, and how high."""
 EXCURSION, KNEES = 0.7, (0.3, 0.15, 0.6)
