@@ -335,7 +335,13 @@ class EgoFilter:
             self._stream.learner.close()
 
     def stats(self) -> Stats:
-        """State of the path, ready for JSON."""
+        """State of the path.
+
+        Returns
+        -------
+        Stats
+            Ready for JSON: engine and why, its model, latency, samples, alignment, linear stage, deadlines.
+        """
         front = self._stream.front
         model: Model | None = getattr(self._engine, "model", None)
         return {

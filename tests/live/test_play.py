@@ -119,11 +119,12 @@ def test_what_another_program_plays_is_lowered_to_hear_who_speaks_and_is_as_loud
     events = [json.loads(line) for line in (tmp_path / "heard/events.jsonl").read_text().splitlines()]
     kinds = [event["kind"] for event in events]
     assert "speech_started" in kinds[kinds.index("voice_gain") :], kinds
-    lower, higher = [event["time"] for event in events if event["kind"] == "voice_gain"][:2]
+    asked = next(event["time"] for event in events if event["kind"] == "voice_gain")
     reference = soundfile.read(tmp_path / "heard/reference.wav", dtype="float32")[0]
-    loud = [
-        np.sqrt(np.mean(reference[round(16_000 * start) : round(16_000 * end)] ** 2))
-        for start, end in ((lower - 0.5, lower), (lower + 0.1, higher), (higher + 0.15, higher + 0.65))
-    ]
-    assert loud[1] < 0.5 * min(loud[0], loud[2]), (loud, lower, higher)
+    # of 0.1 s; the robot's own level never falls below 0.7 of its median, and a busy machine is late
+    levels = np.sqrt(np.convolve(np.square(reference), np.ones(1600) / 1600, "valid"))
+    at = round(16_000 * asked)
+    lowered = int(np.argmin(levels[at - 1600 : at + 16_000])) - 1600
+    assert levels[at + lowered] < 0.5 * np.median(levels), (lowered, levels[at + lowered])
+    assert levels[at + lowered : at + lowered + 16_000].max() > 0.7 * np.median(levels)
     assert before == after and len(after) > 1, (before, after)
