@@ -24,17 +24,29 @@ def share(sound, whole):
     return np.mean([piece.astype("<i2").tobytes() in whole.tobytes() for piece in pieces])
 
 
+def write_room(folder):
+    """The human who interrupts, 1.75 s from before his first word on, and a microphone's own noise, 20 s."""
+    human = 10 * soundfile.read(DEMO / "human.flac", dtype="float32")[0]
+    begins = int(np.argmax(np.abs(human) > 0.1))
+    soundfile.write(folder / "human.wav", human[begins - 4000 : begins + 24_000], 16_000, "PCM_16")
+    noise = 1e-4 * np.random.default_rng(0).standard_normal(20 * 16_000)
+    soundfile.write(folder / "noise.wav", noise, 16_000, "PCM_16")
+
+
+def wait_until_heard(live, folder, seconds):
+    """Return once a run that records has heard so many seconds, or has ended."""
+    heard = folder / "heard/mic.wav"
+    while live.poll() is None and not (heard.exists() and heard.stat().st_size > seconds * 64_000):
+        time.sleep(0.05)
+
+
 def test_the_played_speech_is_the_reference_is_lowered_to_hear_who_speaks_and_ends_when_the_human_does(
     loopback, tmp_path
 ):
     speech = soundfile.read(DEMO / "reference.flac", dtype="int16")[0][:48_000]
     robot = np.tile(speech, 3) | 1  # no sample is zero, so that silence is where nothing is played
     soundfile.write(tmp_path / "robot.wav", robot, 16_000, "PCM_16")
-    human = 10 * soundfile.read(DEMO / "human.flac", dtype="float32")[0]
-    begins = int(np.argmax(np.abs(human) > 0.1))
-    noise = 1e-4 * np.random.default_rng(0).standard_normal(12 * 16_000)  # a microphone's own
-    soundfile.write(tmp_path / "noise.wav", noise, 16_000, "PCM_16")
-    soundfile.write(tmp_path / "human.wav", human[begins - 4000 : begins + 24_000], 16_000, "PCM_16")
+    write_room(tmp_path)
     loudspeaker = subprocess.Popen(
         ["parec", "-d", "robot.monitor", "--rate=16000", "--channels=1", "--format=s16le", "--latency-msec=50", "--raw", tmp_path / "heard.raw"],
         env=loopback.environment,
@@ -48,9 +60,7 @@ def test_the_played_speech_is_the_reference_is_lowered_to_hear_who_speaks_and_en
         ),
         env=loopback.environment, cwd=ROOT, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
-    heard = tmp_path / "heard/mic.wav"
-    while live.poll() is None and not (heard.exists() and heard.stat().st_size > 2 * 64_000):
-        time.sleep(0.05)
+    wait_until_heard(live, tmp_path, 2)
     subprocess.run(["paplay", "-d", "robot_mic", tmp_path / "human.wav"], env=loopback.environment, check=True)
     _, said = live.communicate(timeout=60)
     for process in (loudspeaker, room):
@@ -82,11 +92,7 @@ def test_what_another_program_plays_is_lowered_to_hear_who_speaks_and_is_as_loud
         np.roll(said, turn) for turn in range(0, said.size, 11_000)
     )  # never pauses: only a robot that talks is asked
     soundfile.write(tmp_path / "robot.wav", 0.3 * np.tile(robot, 3) / np.abs(robot).max(), 16_000, "PCM_16")
-    human = 10 * soundfile.read(DEMO / "human.flac", dtype="float32")[0]
-    begins = int(np.argmax(np.abs(human) > 0.1))
-    soundfile.write(tmp_path / "human.wav", human[begins - 4000 : begins + 24_000], 16_000, "PCM_16")
-    noise = 1e-4 * np.random.default_rng(0).standard_normal(20 * 16_000)  # a microphone's own
-    soundfile.write(tmp_path / "noise.wav", noise, 16_000, "PCM_16")
+    write_room(tmp_path)
     programs = [
         subprocess.Popen(["paplay", "-d", sink, tmp_path / f"{name}.wav"], env=loopback.environment)
         for sink, name in (("robot_mic", "noise"), ("robot", "robot"))
@@ -105,9 +111,7 @@ def test_what_another_program_plays_is_lowered_to_hear_who_speaks_and_is_as_loud
         ),
         env=loopback.environment, cwd=ROOT, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
-    heard = tmp_path / "heard/mic.wav"
-    while live.poll() is None and not (heard.exists() and heard.stat().st_size > 3 * 64_000):
-        time.sleep(0.05)
+    wait_until_heard(live, tmp_path, 3)
     before = volumes()
     subprocess.run(["paplay", "-d", "robot_mic", tmp_path / "human.wav"], env=loopback.environment, check=True)
     _, told = live.communicate(timeout=60)
